@@ -3,7 +3,17 @@
 import numpy as np
 import pytest
 
-from madoc.identification.gauss_newton import BLOCK, damped_step, eliminate, thin_qr, triangle, triangular_factors
+from madoc.identification.gauss_newton import (
+    BLOCK,
+    damped_step,
+    eliminate,
+    left_by_states,
+    states_errors,
+    states_steps,
+    thin_qr,
+    triangle,
+    triangular_factors,
+)
 from madoc.identification.linearisation import WindowSlopes
 from madoc.identification.losses import TUNING, curvature_share, loss_slope
 
@@ -90,6 +100,30 @@ def test_damping_shortens_a_states_step(damping):
     slopes = slopes_of([[3.0, 1.0]], [[[1.0], [0.0]]], [[[1.0], [1.0]]])
     found = eliminate(slopes, np.ones((1, 2)), np.array([damping]))
     np.testing.assert_allclose(found.states_step(np.zeros(1)), [[-4.0 / (2.0 + 2.0 * damping)]])
+
+
+@pytest.mark.parametrize("damping", [1e-9, 1.0])
+def test_states_alone_are_stepped_and_left_out_as_beside_parameters(damping):
+    """One state value hardly shows, and two of the four nearly act alike."""
+    random = np.random.default_rng(0)
+    by_states = random.standard_normal((3, 50, 4)) * [1.0, 1e-5, 1e3, 1.0]
+    by_states[..., 3] = by_states[..., 0] + 1e-3 * by_states[..., 3]
+    slopes = slopes_of(random.standard_normal((3, 50)), np.zeros((3, 50, 0)), by_states)
+    weights, each = random.uniform(0.5, 2.0, (3, 50)), np.full(3, damping)
+    wanted = eliminate(slopes, weights, each)
+    steps = states_steps(slopes.by_states, slopes.residuals, weights, np.stack([each, 1e3 * each]))
+    np.testing.assert_allclose(steps[0], wanted.states_step(np.zeros(0)), rtol=1e-4)
+    np.testing.assert_allclose(steps[1], eliminate(slopes, weights, 1e3 * each).states_step(np.zeros(0)), rtol=1e-4)
+    alike = eliminate(slopes, np.ones((3, 50)), each)
+    left, spare = left_by_states(slopes, each)
+    np.testing.assert_allclose(left, alike.reduced.residuals[:, :50], atol=1e-12)
+    np.testing.assert_allclose(spare, alike.spare, atol=1e-12)
+
+
+def test_the_error_of_a_state_that_two_readings_show():
+    # Readings of 1 and 3 times the state have an information of 1² + 3², and damping adds as much as it says.
+    assert states_errors(np.array([[[1.0], [3.0]]]), NOTHING) == pytest.approx(1.0 / np.sqrt(10.0))
+    assert states_errors(np.array([[[1.0], [3.0]]]), np.ones(1)) == pytest.approx(1.0 / np.sqrt(20.0))
 
 
 def test_newtons_step_of_a_loss_ends_at_its_minimum_where_one_of_weighted_squares_leaves_a_fifth_of_the_way():

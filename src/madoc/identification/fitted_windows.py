@@ -9,7 +9,15 @@ from jaxtyping import Bool, Float, Int
 from madoc.data.dataset import Dataset
 from madoc.data.timescale import stride
 from madoc.identification.ensembles import with_contacts_settled
-from madoc.identification.gauss_newton import Eliminated, damped_step, eliminate, states_basis, triangular_factors
+from madoc.identification.gauss_newton import (
+    Eliminated,
+    damped_step,
+    eliminate,
+    left_by_states,
+    states_basis,
+    states_steps,
+    triangular_factors,
+)
 from madoc.identification.linearisation import WindowSlopes
 from madoc.identification.losses import TUNING, loss_slope, loss_value, scale_of
 from madoc.identification.noise import channel_noise
@@ -133,6 +141,11 @@ class Fit:
         """What no initial state explains of the residuals, to first order."""
         residuals = self.slopes.residuals[..., None]
         return (residuals - self.explicable @ (np.swapaxes(self.explicable, 1, 2) @ residuals))[..., 0]
+
+    @cached_property
+    def spare(self) -> Float[np.ndarray, "windows values"]:
+        """1 - leverage of each value: the share of its noise that its window's initial state does not absorb."""
+        return 1.0 - (self.explicable**2).sum(-1)
 
     @cached_property
     def unexplained(self) -> float:
@@ -279,9 +292,9 @@ def _with_fitted_states(simulator: Simulator, readings: Readings, fit: Fit) -> F
         slopes, states = fit.slopes, fit.states
         if not slopes.whole.any():
             break
-        noise = _noise(slopes, readings)
-        scaled = slopes.over(noise)
-        step = _eliminated(scaled, _weights(scaled)).states_step(np.zeros(len(fit.point)))
+        noise = _noise(fit.left, fit.spare, slopes.whole, readings)
+        scaled, damping = slopes.over(noise), np.full((1, len(states)), _STATE_DAMPING)
+        (step,) = states_steps(scaled.by_states, scaled.residuals, _weights(scaled), damping)
         moved = states + readings.in_state_units(step, states.shape[1])
         after = readings.residuals(simulator, fit.point[None], moved[None])[0, 0]
         before, now = _costs(scaled.residuals), _costs(after / noise)
@@ -335,7 +348,8 @@ def reduced_of(slopes: WindowSlopes, readings: Readings, count: int) -> Reduced 
     kept = WindowSlopes(
         slopes.residuals[finite], slopes.by_parameters[finite], slopes.by_states[finite], slopes.whole[finite]
     )
-    noise = _noise(kept, readings)
+    left = left_by_states(kept, np.full(len(kept.residuals), _STATE_DAMPING))
+    noise = _noise(*left, kept.whole, readings)
     scaled = kept.over(noise)
     return Reduced(_eliminated(scaled, _weights(scaled)), noise, finite, count)
 
@@ -354,16 +368,18 @@ def negligible(slopes: WindowSlopes) -> bool:
 
 def noise_of(fit: Fit, readings: Readings) -> Float[np.ndarray, " channels"]:
     """Standard deviation of each channel's noise in its typical changes, by what a fit leaves of its windows."""
-    return _noise(fit.slopes, readings)[: len(readings.scale)]
+    return _noise(fit.left, fit.spare, fit.slopes.whole, readings)[: len(readings.scale)]
 
 
-def _noise(slopes: WindowSlopes, readings: Readings) -> Float[np.ndarray, " values"]:
+def _noise(
+    left: Float[np.ndarray, "windows values"],
+    spare: Float[np.ndarray, "windows values"],
+    whole: Bool[np.ndarray, " windows"],
+    readings: Readings,
+) -> Float[np.ndarray, " values"]:
     """Standard deviation of each value's noise, by what no initial state explains of the residuals."""
-    alike = _eliminated(slopes, np.ones_like(slopes.residuals))
-    shape = (len(slopes.residuals), readings.steps + 1, len(readings.scale))
-    left = alike.reduced.residuals[:, : shape[1] * shape[2]]
-    noise = channel_noise(left.reshape(shape)[slopes.whole], alike.spare.reshape(shape)[slopes.whole])
-    return np.tile(noise, shape[1])
+    shape = (-1, readings.steps + 1, len(readings.scale))
+    return np.tile(channel_noise(left[whole].reshape(shape), spare[whole].reshape(shape)), shape[1])
 
 
 def _weights(slopes: WindowSlopes) -> Float[np.ndarray, "windows values"]:

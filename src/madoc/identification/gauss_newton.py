@@ -179,11 +179,59 @@ def states_basis(
     What a window's initial state explains of its residuals is Q Qᵀ r, of which the first `values` rows are meant.
     """
     windows, _, states = by_states.shape
-    lengths = np.linalg.norm(by_states, axis=1)
-    lengths = np.maximum(lengths, np.maximum(_SHORTEST * lengths.max(-1, keepdims=True), np.finfo(float).tiny ** 0.25))
+    lengths = _lengths(np.linalg.norm(by_states, axis=1))
     damped = np.zeros((windows, states, states))
     damped[:, np.arange(states), np.arange(states)] = np.sqrt(damping)[:, None] * lengths
     return thin_qr(np.concatenate([by_states, damped], axis=1))
+
+
+def left_by_states(
+    slopes: WindowSlopes, damping: Float[np.ndarray, " windows"]
+) -> tuple[Float[np.ndarray, "windows values"], Float[np.ndarray, "windows values"]]:
+    """What initial states cannot explain of the residuals, and 1 - leverage of each value, as in `Eliminated`."""
+    basis = states_basis(slopes.by_states, damping)[0][:, : slopes.residuals.shape[1]]
+    within = np.swapaxes(basis, 1, 2) @ slopes.residuals[..., None]
+    return slopes.residuals - (basis @ within)[..., 0], 1.0 - (basis**2).sum(-1)
+
+
+def states_steps(
+    by_states: Float[np.ndarray, "windows values n"],
+    residuals: Float[np.ndarray, "windows values"],
+    weights: Float[np.ndarray, "windows values"],
+    dampings: Float[np.ndarray, "trials windows"],
+) -> Float[np.ndarray, "trials windows n"]:
+    """Every window's step of its initial state alone, for each damping, as `Eliminated.states_step` of no parameters.
+
+    The normal equations are solved. A relative damping of 10^-9 or more, which they must have, bounds their condition,
+    so that a step is right to about 10^-5 of its length.
+    """
+    weighted = np.swapaxes(np.sqrt(weights)[..., None] * by_states, 1, 2)
+    normal = weighted @ np.swapaxes(weighted, 1, 2)
+    slope = (weighted @ (np.sqrt(weights) * residuals)[..., None])[..., 0]
+    damped, lengths = _damped(normal, dampings)
+    return -np.linalg.solve(damped, (slope / lengths)[..., None])[..., 0] / lengths
+
+
+def states_errors(
+    by_states: Float[np.ndarray, "windows values n"], damping: Float[np.ndarray, " windows"]
+) -> Float[np.ndarray, "windows n"]:
+    """Standard errors of every window's initial state, for residuals in standard deviations of their noise."""
+    damped, lengths = _damped(np.swapaxes(by_states, 1, 2) @ by_states, damping)
+    return np.sqrt(np.diagonal(np.linalg.inv(damped), axis1=-2, axis2=-1)) / lengths
+
+
+def _damped(
+    normal: Float[np.ndarray, "windows n n"], damping: Float[np.ndarray, "*trials windows"]
+) -> tuple[Float[np.ndarray, "*trials windows n n"], Float[np.ndarray, "windows n"]]:
+    """Normal matrices of columns of length 1 with a relative damping, and the lengths that the columns had."""
+    lengths = _lengths(np.sqrt(np.diagonal(normal, axis1=-2, axis2=-1)))
+    alike = normal / (lengths[:, :, None] * lengths[:, None, :])
+    return alike + damping[..., None, None] * np.eye(normal.shape[-1]), lengths
+
+
+def _lengths(found: Float[np.ndarray, "windows n"]) -> Float[np.ndarray, "windows n"]:
+    """Lengths of the columns by which damping is measured: none is far shorter than its window's longest."""
+    return np.maximum(found, np.maximum(_SHORTEST * found.max(-1, keepdims=True), np.finfo(float).tiny ** 0.25))
 
 
 def eliminate(

@@ -12,7 +12,7 @@ from functools import cache
 import numpy as np
 from jaxtyping import Bool, Float
 
-from madoc.identification.gauss_newton import eliminate, states_basis
+from madoc.identification.gauss_newton import left_by_states, states_errors, states_steps
 from madoc.identification.linearisation import DIFFERENCE, WindowSlopes
 from madoc.identification.losses import TUNING, Loss, loss_slope, loss_value
 from madoc.identification.noise import channel_noise
@@ -96,8 +96,8 @@ def settle(
     deviation, errors = _noise_and_errors(slopes, readings)
     scaled = slopes.over(np.tile(deviation, readings.steps + 1))
     weights = loss_slope((scaled.residuals / TUNING[loss]) ** 2, loss) * scaled.whole[:, None]
-    steps = [eliminate(scaled, weights, damping * factor).states_step(np.zeros(0)) for factor in TRIALS]
-    moved = states + readings.in_state_units(np.stack(steps), states.shape[1])
+    steps = states_steps(scaled.by_states, scaled.residuals, weights, np.array(TRIALS)[:, None] * damping)
+    moved = states + readings.in_state_units(steps, states.shape[1])
     after = readings.residuals(simulator, point[None], moved.reshape(1, -1, states.shape[1]))[0]
     whole = np.where(slopes.whole[:, None], slopes.residuals, np.nan)
     costs = window_costs(np.concatenate([after, whole[None]]) / np.tile(deviation, readings.steps + 1), loss)
@@ -226,14 +226,10 @@ def _noise_and_errors(
     slopes: WindowSlopes, readings: Readings
 ) -> tuple[Float[np.ndarray, " channels"], Float[np.ndarray, " physical"]]:
     """Noise of each channel by what initial states cannot explain, and the states' standard errors that follow."""
-    windows, least = len(readings), np.full(len(readings), LEAST_DAMPING)
-    shape = (windows, *readings.observed.shape[1:])
-    alike = eliminate(slopes, np.ones_like(slopes.residuals), least)
-    left = alike.reduced.residuals[:, : shape[1] * shape[2]].reshape(shape)
-    deviation = channel_noise(left[slopes.whole], alike.spare.reshape(shape)[slopes.whole])
-    if not slopes.whole.any():
+    least, whole = np.full(len(readings), LEAST_DAMPING), slopes.whole
+    left = (part.reshape(-1, *readings.observed.shape[1:])[whole] for part in left_by_states(slopes, least))
+    deviation = channel_noise(*left)
+    if not whole.any():
         return deviation, np.zeros(len(readings.spread))
-    by_states = slopes.by_states[slopes.whole] / np.tile(deviation, readings.steps + 1)[:, None]
-    factor = states_basis(by_states, least[slopes.whole])[1]
-    errors = np.linalg.norm(np.linalg.inv(factor), axis=-1)
+    errors = states_errors(slopes.by_states[whole] / np.tile(deviation, readings.steps + 1)[:, None], least[whole])
     return deviation, np.minimum(np.median(errors, axis=0), 1.0)

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from madoc.data import Dataset
 from madoc.identification.ensembles import likely_states
-from madoc.identification.gauss_newton import eliminate
+from madoc.identification.gauss_newton import states_steps
 from madoc.identification.replay import Readings, slopes_at
 from madoc.identification.states import LoggedStates, states_of
 from madoc.identification.windows import evenly, rows_that_fit
@@ -117,8 +117,9 @@ class FittedReplays:
         for _ in range(self.most_steps):
             part, around = first.of(gaining), states[gaining]
             (slopes,) = slopes_at(self.simulator, part, point[None], around[None], parameters=False)
-            fit = eliminate(slopes, np.ones_like(slopes.residuals), np.full(len(part), _DAMPING))
-            step = first.in_state_units(fit.states_step(np.zeros(0)) * ~self.logged.in_plane, states.shape[1])
+            damping, alike = np.full((1, len(part)), _DAMPING), np.ones_like(slopes.residuals)
+            (moved,) = states_steps(slopes.by_states, slopes.residuals, alike, damping)
+            step = first.in_state_units(moved * ~self.logged.in_plane, states.shape[1])
             tried = around + _SHARES[:, None, None] * step
             residuals = part.residuals(self.simulator, point[None], tried.reshape(1, -1, states.shape[1]))[0]
             spent += len(part) * first.steps * (1 + len(first.spread) + len(_SHARES))

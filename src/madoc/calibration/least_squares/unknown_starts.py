@@ -18,7 +18,7 @@ from madoc.calibration.least_squares.statistics import (
     outlier_limits,
 )
 from madoc.errors import MadocError
-from madoc.identification.gauss_newton import damped_step, eliminate, triangular_factors
+from madoc.identification.gauss_newton import damped_step, eliminate, left_by_states, triangular_factors
 from madoc.identification.information import at_least_noise, bread, jackknife_meat, least_share
 from madoc.identification.linearisation import WindowSlopes
 from madoc.identification.losses import TUNING, Loss, curvature_share, loss_slope
@@ -204,7 +204,7 @@ class UnknownStarts:
     ) -> Plan:
         """The plan of one search; once it refines, channels are weighted by noise and untrusted windows left out."""
         least = np.full(len(state_damping), LEAST_DAMPING)
-        spare = eliminate(slopes, np.ones_like(slopes.residuals), least).spare
+        spare = left_by_states(slopes, least)[1]
         kept, deviation = self._weighted(slopes, spare, refining=refining)
         slopes = slopes.over(np.tile(deviation, self.readings.steps + 1))
         z = (slopes.residuals / TUNING[self.loss]) ** 2
