@@ -6,7 +6,7 @@ from dataclasses import asdict
 import numpy as np
 from pydantic import TypeAdapter
 
-from madoc.calibration.holdout import AgainstChance, Area, Predicted, PredictionError, PredictionErrors
+from madoc.calibration.holdout import AgainstChance, Predicted, PredictionError, PredictionErrors
 from madoc.identification.combinations import Combination
 from madoc.identification.term_tests import Alternative, MissingTerm
 
@@ -68,8 +68,6 @@ def result(**changes):
         errors=PredictionErrors(errors, errors, errors, errors, 0.04, (0.03, 0.05), 0.04, 100, 0),
         explained=0.0,
         autocorrelation=0.0,
-        area_at_mid_range=Area(0.9, (0.8, 0.95), 100),
-        area_at_estimate=Area(0.52, (0.45, 0.6), 100),
     )
     return {
         "method": "madoc",

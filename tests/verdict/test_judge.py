@@ -48,9 +48,7 @@ ERRORS = PredictionErrors(
     failed_windows=0,
 )
 BEFORE, AFTER = Area(0.9, (0.87, 0.93), 400), Area(0.5, (0.46, 0.54), 400)
-PREDICTED = Predicted(
-    **COMMON, errors=ERRORS, explained=0.02, autocorrelation=-0.5, area_at_mid_range=BEFORE, area_at_estimate=AFTER
-)
+PREDICTED = Predicted(**COMMON, errors=ERRORS, explained=0.02, autocorrelation=-0.5)
 FITTED = Fitted(**COMMON, errors=ERRORS, explained=0.02, fitted_steps=10)
 TOLD_APART = ToldApart(**COMMON, area_at_mid_range=BEFORE, area_at_estimate=AFTER)
 EITHER = pytest.mark.parametrize("good", [PREDICTED, FITTED])

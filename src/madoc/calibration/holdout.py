@@ -248,15 +248,11 @@ class Predicted(JudgedByErrors):
         persistence: Correlation of these residuals with those a few rows later; 0 if it is not certain.
         beside_random: By signal, how many times as large errors of the longest horizon are, at the best parameters
             nearby, as sensor noise and random forces of each step make them; the lower end of a 95 % interval.
-        area_at_mid_range: How well a classifier distinguishes replays at mid-range from logged windows.
-        area_at_estimate: The same for replays at the estimate.
     """
 
     autocorrelation: float
     persistence: float = 0.0
     beside_random: dict[str, float] = field(default_factory=dict)
-    area_at_mid_range: Area
-    area_at_estimate: Area
     measure: Literal["predicted"] = "predicted"
 
 

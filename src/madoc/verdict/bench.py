@@ -228,4 +228,4 @@ class Bench:
         )
         if len(held.episode_starts) == len(held):  # loose rows: windows of one row, of rollouts too
             simulated = replace(simulated, episode_starts=np.arange(len(simulated)))
-        return classify(self.view.sample(held), self.view.sample(simulated), overlap=True)
+        return classify(self.view.sample(held), self.view.sample(simulated))

@@ -26,7 +26,6 @@ from madoc.verdict.statistics import (
     relative_to_first,
 )
 from madoc.verdict.systematic import EXPLAINED, autocorrelation, explained, explained_at_end, persistence
-from madoc.verdict.two_sample import classify, replayed
 
 WHOLE_STEPS = 3
 """Number of Gauss-Newton steps on whole windows, at least 1; they begin at the minimum of single steps."""
@@ -40,14 +39,10 @@ TOUCHING = 0.1
 
 def predicted(bench: Bench, point: Float[np.ndarray, " d"], interval: Float[np.ndarray, "d 2"] | None) -> Predicted:
     """The errors of an estimate, in [-1, 1], of mid-range, of the best parameters nearby, and of noise alone."""
-    replays, found = bench.replays, _replayed(bench, point)
+    found = _replayed(bench, point)
     best, single = found.best, found.single
     systems = {"the simulator at mid-range": np.zeros(len(point)), "the simulator at the best parameters nearby": best}
     lasting, rows = _persistence(bench, best)
-    area_at_mid_range, area_at_estimate = (
-        classify(*replayed(replays, bench.scaling, part, found.noisy), overlap=False)
-        for part in (found.at_mid_range, found.at_estimate)
-    )
     at_end, refitting = _explained_at_end(bench, best, found.at_best, point, interval)
     beside, of_chance = _beside_random(bench, found)
     record = partial(
@@ -57,8 +52,6 @@ def predicted(bench: Bench, point: Float[np.ndarray, " d"], interval: Float[np.n
         autocorrelation=single.autocorrelation,
         persistence=lasting,
         beside_random=dict(zip(bench.simulator.task.signal_names, beside.tolist(), strict=True)),
-        area_at_mid_range=area_at_mid_range,
-        area_at_estimate=area_at_estimate,
     )
     return judged(
         record,
@@ -114,7 +107,7 @@ def _without(
 
 
 class _Replayed(NamedTuple):
-    """What replays of the hold-out leave at mid-range, at an estimate and at the `best` parameters nearby.
+    """What replays of the hold-out leave at an estimate, and at the `best` parameters nearby.
 
     Residuals are in typical changes of a stride, of shape (windows, steps, observation); `noisy` are those that noise
     alone would cause at the best parameters.
@@ -122,8 +115,6 @@ class _Replayed(NamedTuple):
 
     errors: PredictionErrors
     best: Float[np.ndarray, " d"]
-    at_mid_range: Float[np.ndarray, "windows steps observation"]
-    at_estimate: Float[np.ndarray, "windows steps observation"]
     at_best: Float[np.ndarray, "windows steps observation"]
     noisy: Float[np.ndarray, "windows steps observation"]
     single: "_SingleSteps"
@@ -152,7 +143,7 @@ def _replayed(bench: Bench, point: Float[np.ndarray, " d"]) -> _Replayed:
         stride=stride(bench.problem.dataset),
     )
     spent = searching + residuals[..., 0].size + noisy[..., 0].size * 2 + single.control_steps
-    return _Replayed(errors, points[best], residuals[0], residuals[1], residuals[best], noisy[0], single, spent)
+    return _Replayed(errors, points[best], residuals[best], noisy[0], single, spent)
 
 
 def _beside_random(bench: Bench, found: _Replayed) -> tuple[Float[np.ndarray, " observation"], int]:

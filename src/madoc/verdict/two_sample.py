@@ -22,7 +22,6 @@ from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.simulation.base import Simulator
 from madoc.simulation.rollout import begin, reset_states, roll
 from madoc.types import Transitions
-from madoc.verdict.prediction import Replays
 from madoc.verdict.statistics import interval_of
 
 MOST_ROWS = 1000
@@ -55,11 +54,11 @@ class Sample(NamedTuple):
         return Sample(self.before[chosen], self.after[chosen])
 
 
-def classify(real: Sample, simulated: Sample, *, overlap: bool) -> Area:
+def classify(real: Sample, simulated: Sample) -> Area:
     """Cross-validated area under the ROC curve; 0.5 with an interval from 0 to 1 where there are too few rows.
 
-    With `overlap`, the two kinds may be distributed differently before the change. Simulated rows are then weighted by
-    a second classifier's odds that `before` is of the log, so that only changes are compared.
+    The two kinds may be distributed differently before the change. Simulated rows are weighted by a second classifier's
+    odds that `before` is of the log, so that only changes are compared.
     """
     samples = real.thinned(), simulated.thinned()
     rows = [len(sample.before) for sample in samples]
@@ -69,37 +68,12 @@ def classify(real: Sample, simulated: Sample, *, overlap: bool) -> Area:
         return Area(0.5, (0.0, 1.0), sum(rows))
     label = np.repeat([True, False], rows)
     before, after = (np.concatenate(parts) for parts in zip(*samples, strict=True))
-    weight = None
-    if overlap:
-        likely = np.clip(_unseen(before, label, None), 0.01, 0.99)
-        odds = np.clip(likely / (1.0 - likely), 1.0 / ODDS_LIMIT, ODDS_LIMIT)
-        weight = np.where(label, 1.0, odds / odds[~label].mean())
+    likely = np.clip(_unseen(before, label, None), 0.01, 0.99)
+    odds = np.clip(likely / (1.0 - likely), 1.0 / ODDS_LIMIT, ODDS_LIMIT)
+    weight = np.where(label, 1.0, odds / odds[~label].mean())
     scores = _unseen(np.concatenate([before, after], axis=1), label, weight)
     area = float(roc_auc_score(label, scores, sample_weight=weight))
     return Area(area, _interval(scores, label, weight), sum(rows))
-
-
-def replayed(
-    replays: Replays,
-    scaling: Scaling,
-    residuals: Float[np.ndarray, "windows steps observation"],
-    noise: Float[np.ndarray, "windows steps observation"],
-) -> tuple[Sample, Sample]:
-    """A random half of the windows as they were logged, the other half as simulated, with noise added.
-
-    `before` is the first observation and the mean action of a window, `after` the change over the whole window.
-    Residuals, and the noise among them, are in typical changes of a stride.
-    """
-    windows = replays.windows
-    start, end = replays.observation, windows.following[:, -1]
-    simulated = end + (residuals[:, -1] + noise[:, -1]) * replays.scale
-    order = np.random.default_rng(0).permutation(len(windows))
-    real, other = order[::2], order[1::2]
-    other = other[np.isfinite(simulated[other]).all(-1)]
-    pair = np.concatenate([start, windows.actions.mean(1)], axis=1)
-    before = (pair - scaling.pair_offset) / scaling.pair_scale
-    logged, changed = ((after - start) / replays.scale for after in (end, simulated))
-    return Sample(before[real], logged[real]), Sample(before[other], changed[other])
 
 
 def behaviour(kept: Dataset, key: PRNGKeyArray) -> TanhGaussianPolicy:
@@ -219,13 +193,13 @@ def _unseen(
     return np.asarray(chances)[:, 1]
 
 
-def _interval(scores: np.ndarray, label: np.ndarray, weight: np.ndarray | None) -> tuple[float, float]:
+def _interval(scores: np.ndarray, label: np.ndarray, weight: np.ndarray) -> tuple[float, float]:
     """95 % bootstrap interval of the area, rows of each kind resampled.
 
     The area is the share of pairs whose row of the log has the higher score; ties count half (Hanley and McNeil 1982).
     """
     rng, order = np.random.default_rng(0), np.argsort(scores)
-    label, weight = label[order], np.ones(len(scores)) if weight is None else weight[order]
+    label, weight = label[order], weight[order]
     ties = np.flatnonzero(np.diff(scores[order], prepend=-np.inf))
     totals = []
     for kind in (label, ~label):

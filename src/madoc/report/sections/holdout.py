@@ -23,7 +23,7 @@ def holdout(run: Run) -> dict[str, object] | str:
     if held is None:
         return "Nothing was held out to judge the estimate by."
     facts = [("rows held out", count(held.rows)), ("episodes", count(held.episodes))]
-    if not isinstance(held, Fitted):
+    if isinstance(held, ToldApart):
         areas = (held.area_at_mid_range.area, held.area_at_estimate.area)
         told = "how well a classifier tells simulated from logged motion, mid-range → calibrated (0.5: not at all)"
         facts.append((told, " → ".join(number(area, 2) for area in areas)))
