@@ -64,7 +64,7 @@ def result(**changes):
             MissingTerm("Coulomb friction", "dof_frictionloss.hip", 0.2, 0.02, "N·m", 0.3, 10.0, {"gravity": -2.0}),
             MissingTerm("a spring", "jnt_stiffness.hip", 1.0, 0.4, "N·m/rad", 0.01, 2.5, {"gravity": 0.5}),
         ),
-        alternatives=(Alternative(("a spring (jnt_stiffness.hip)",), True, {"gravity": 0.5}, {"gravity": 0.4}),),
+        alternatives=(Alternative(("a spring (jnt_stiffness.hip)",), {"gravity": 0.5}, {"gravity": 0.4}),),
         errors=PredictionErrors(errors, errors, errors, errors, 0.04, (0.03, 0.05), 0.04, 100, 0),
         explained=0.0,
         autocorrelation=0.0,

@@ -30,7 +30,7 @@ from madoc.verdict.adequacy import (
     with_widened_intervals,
 )
 
-BEYOND = Alternative(("a spring",), True, {"mass": 3.0, "damping": -0.5}, {"mass": 0.0, "damping": 2.4 / SURER})
+BEYOND = Alternative(("a spring",), {"mass": 3.0, "damping": -0.5}, {"mass": 0.0, "damping": 2.4 / SURER})
 
 
 def term(cause="friction", t=8.0, shift=2.0, explained=0.1, parameter="dof_frictionloss.hip"):
@@ -93,7 +93,7 @@ def test_terms_that_parameters_imitate_are_told():
 def test_other_estimates_by_a_coarse_step_are_taken_in_full():
     """At a value of a half, a shift of 3 half-widths is one of 6; what other terms do is as it is."""
     step = replace(term(INTEGRATION, t=20.0, explained=0.4, parameter=""), value=0.5)
-    by_step = Alternative((INTEGRATION,), True, {"mass": 3.0}, {"mass": 0.5})
+    by_step = Alternative((INTEGRATION,), {"mass": 3.0}, {"mass": 0.5})
     (full,) = in_full((by_step,), [step])
     assert (full.shifts, full.errors) == ({"mass": 6.0}, {"mass": 1.0})
     spring = replace(by_step, causes=("a spring",))

@@ -166,7 +166,7 @@ def _between_runs(tests: TermTests) -> tuple[list[MissingTerm], list[Alternative
         terms.append(MissingTerm(DRIFT, row.name, deviation * half, error * half, row.unit, 0.0, t, shift))
         if t >= SUSPICIOUS:  # then an interval is to hold the value of any run
             errors = {row.name: NORMAL_95 * float(np.hypot(deviation, error)) / half_width}
-            others.append(Alternative((f"{row.name} changing from run to run",), False, {row.name: 0.0}, errors, True))
+            others.append(Alternative((f"{row.name} changing from run to run",), {row.name: 0.0}, errors, True))
     return terms, others
 
 
@@ -235,7 +235,7 @@ def _of_fitted_parts(
         errors = tests.by_name(NORMAL_95 * np.sqrt(part.variance))
         for name in names:
             cause = f"{name} changing over the log"
-            yield Alternative((cause,), False, {name: shifts[name]}, {name: errors[name]}, parts=True)
+            yield Alternative((cause,), {name: shifts[name]}, {name: errors[name]}, parts=True)
 
 
 def _of_fitted_runs(
@@ -254,7 +254,7 @@ def _of_fitted_runs(
         kind, half_width = common(values, np.sqrt(variances)), float(tests.half_widths[index])
         shift, reach = (kind.mean - float(point[index])) / half_width, NORMAL_95 * kind.spread / half_width
         cause = f"{name} changing from run to run"
-        yield Alternative((cause,), False, {name: shift}, {name: reach}, parts=True)
+        yield Alternative((cause,), {name: shift}, {name: reach}, parts=True)
 
 
 def _most_certain(drifts: Iterable[MissingTerm]) -> Iterable[MissingTerm]:
@@ -275,4 +275,4 @@ def _of_parts(drifts: Iterable[MissingTerm]) -> Iterator[Alternative]:
             for side in (-shift, shift):
                 when = "over the log" if term.cause == DRIFT else "within each run"
                 causes, shifts = (f"{term.parameter} changing {when}",), {term.parameter: side}
-                yield Alternative(causes, False, shifts, errors, parts=True)
+                yield Alternative(causes, shifts, errors, parts=True)

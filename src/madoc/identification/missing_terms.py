@@ -193,7 +193,7 @@ def _of_chosen(
     if richer is None or len(richer.terms) < len(chosen):
         others.append(together)
     further = [*_rivals(tests, chosen), *_further(tests, chosen)]
-    others += [replace(_with_terms(tests, rivals), terms=False) for rivals in further]
+    others += [_with_terms(tests, rivals) for rivals in further]
     return ({}, others, 0) if richer is None else (richer.terms, others, richer.control_steps)
 
 
@@ -304,7 +304,7 @@ def _with_terms(tests: TermTests, chosen: list[int]) -> Alternative:
             alone = tests.score(index)
             error = np.hypot(error, 0.0 if alone is None else alone.shifts)
     causes = tuple(dict.fromkeys(named(tests.tried[index]) for index in chosen))
-    return tests.alternative(causes, shift, error, terms=True)
+    return tests.alternative(causes, shift, error)
 
 
 def _fitted(
@@ -352,7 +352,7 @@ def _fitted(
             term = replace(term_of(candidate, found, shifts), value=value, standard_error=deviation, t=significance)
             terms[candidate.parameter] = term
     causes = tuple(named(candidate) for candidate, _, _ in possible)
-    return _RicherModel(terms, Alternative(causes, True, shifts, tests.by_name(beyond)), fit.control_steps)
+    return _RicherModel(terms, Alternative(causes, shifts, tests.by_name(beyond)), fit.control_steps)
 
 
 def _of_friction(tests: TermTests, chosen: list[int]) -> Iterator[Alternative]:
@@ -384,7 +384,7 @@ def _of_forces(tests: TermTests, chosen: list[int]) -> Iterator[Alternative]:
         tried = is_joint_force(candidate.cause) or is_late(candidate.cause)
         found = tests.score(index, chosen) if tried else None
         if found is not None and abs(found.t) >= LIKELY_FORCE:
-            yield replace(_with_terms(tests, [index, *chosen]), terms=False)
+            yield _with_terms(tests, [index, *chosen])
 
 
 def _of_other_windows(tests: TermTests, led: Float[np.ndarray, " d"]) -> Iterator[Alternative]:
@@ -397,4 +397,4 @@ def _of_other_windows(tests: TermTests, led: Float[np.ndarray, " d"]) -> Iterato
     ]
     if apart:
         beyond = {name: NORMAL_95 * errors[name] for name in apart}
-        yield Alternative((OTHER_WINDOWS,), False, {name: shifts[name] for name in apart}, beyond)
+        yield Alternative((OTHER_WINDOWS,), {name: shifts[name] for name in apart}, beyond)

@@ -64,7 +64,6 @@ class Alternative:
 
     Attributes:
         causes: What it rests on, in words.
-        terms: Whether these are the terms that the log asks for, all together.
         shifts: By how much it moves each calibrated parameter, in half-widths of its 95 % interval.
         errors: Half of the 95 % interval of each shift, in the same unit.
         parts: Whether it is the estimate of a part of the log.
@@ -72,7 +71,6 @@ class Alternative:
     """
 
     causes: tuple[str, ...]
-    terms: bool
     shifts: dict[str, float]
     errors: dict[str, float]
     parts: bool = False
@@ -131,11 +129,10 @@ class TermTests:
         shift: Float[np.ndarray, " d"],
         error: Float[np.ndarray, " d"],
         *,
-        terms: bool = False,
         bounded: bool = False,
     ) -> Alternative:
         """The estimate with candidates that shift it by this much in [-1, 1], from the given one."""
-        return Alternative(causes, terms, self.by_name(self.moved + shift), self.by_name(error), bounded=bounded)
+        return Alternative(causes, self.by_name(self.moved + shift), self.by_name(error), bounded=bounded)
 
 
 def term_of(candidate: Candidate, found: Score, shifts: dict[str, float]) -> MissingTerm:

@@ -90,7 +90,6 @@ def of_small_terms(terms: Sequence[MissingTerm], least: float = WORTH_NAMING) ->
     return tuple(
         Alternative(
             (named(term),),
-            terms=False,
             shifts=dict(term.shifts),
             errors={name: NORMAL_95 * abs(shift / term.t) for name, shift in term.shifts.items()},
         )

@@ -92,7 +92,7 @@ def _doubts(
     left = felt(fine.terms)
     if not fine.tested or (left is not None and left.explained >= NUMERICAL):
         return replace(doubts, control_steps=spent), False
-    others = [replace(each, terms=False) for each in doubts.alternatives]
+    others = [*doubts.alternatives]
     others += [
         replace(each, causes=(INTEGRATION,)) if each.causes == (OTHER_WINDOWS,) else each for each in fine.alternatives
     ]
