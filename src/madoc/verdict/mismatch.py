@@ -32,10 +32,11 @@ def lacking(holdout: HoldOut, *, settled: bool, unlike_noise: bool) -> Verdict |
     An end of a range at which a search stands that has not settled says nothing. `unlike_noise` tells that residuals
     have longer tails than noise has, or that each is like the next.
     """
+    holdout = holdout if settled else replace(holdout, at_end=())
     found = _missing(holdout, missing_term(holdout)) or _mismatch(holdout)
     if far_beyond_noise(holdout) and numerical(holdout) is None:
         found = found or _missing(holdout, missing_term(holdout, least=0.0))
-    found = found or (_outside(holdout) if settled else None)
+    found = found or _outside(holdout)
     return found or (_unlike_noise(holdout) if unlike_noise else None)
 
 

@@ -204,7 +204,8 @@ def _told_apart(found: Measure, doubts: Suspicions, *, finer: bool) -> Measure:
     others = [term for term in _worth_keeping(doubts.terms) if term.cause != INTEGRATION]
     terms = tuple(sorted((*step, *others), key=lambda term: -abs(term.t)))
     spent = found.control_steps + doubts.control_steps
-    return replace(found, missing_terms=terms if doubts.tested else found.missing_terms, control_steps=spent)
+    found = replace(found, control_steps=spent)
+    return replace(found, missing_terms=terms, finer=finer) if doubts.tested else found
 
 
 def _delay(doubts: Suspicions, late: Finding) -> MissingTerm | None:
