@@ -35,9 +35,13 @@ def fitted(
     bench: Bench, replays: FittedReplays, point: Float[np.ndarray, " d"], interval: Float[np.ndarray, "d 2"] | None
 ) -> Fitted:
     """The errors of an estimate, in [-1, 1], of mid-range, of the best parameters nearby, and of noise alone."""
-    nearby, searching = _nearby_best(replays, point)
-    points = np.concatenate([np.zeros((1, len(point))), point[None], nearby])
-    residuals, predicting = replays.residuals(points)
+    given = np.stack([np.zeros(len(point)), point])
+    starts, fitting = replays.starts(given)
+    nearby, searching = _nearby_best(replays, point, starts[1])
+    points = np.concatenate([given, nearby])
+    beside, predicting = replays.residuals(nearby, starts[1])
+    residuals = np.concatenate([replays.residuals_from(given, starts), beside])
+    predicting += fitting + len(given) * len(replays.readings) * replays.readings.steps
     sizes = magnitudes(replays.at_horizons(residuals))
     best = best_of(sizes)
     noise = residual_noise(residuals[best][:, : replays.fitted + 1], len(replays.readings.spread))
@@ -91,15 +95,16 @@ def _with_noise_alone(
     return replace(replays, readings=drawn).residuals(point[None])
 
 
-def _nearby_best(replays: FittedReplays, point: Float[np.ndarray, " d"]) -> tuple[Float[np.ndarray, "points d"], int]:
+def _nearby_best(
+    replays: FittedReplays, point: Float[np.ndarray, " d"], states: Float[np.ndarray, "windows state"]
+) -> tuple[Float[np.ndarray, "points d"], int]:
     """The last points of Gauss-Newton steps from an estimate on whole windows of the hold-out, and their control steps.
 
-    Initial states are unknowns too. These points have been fitted to the hold-out itself, so none is an estimate: they
-    show what parameters could reach.
+    Initial states, which begin at those given, are unknowns too. These points have been fitted to the hold-out itself,
+    so none is an estimate: they show what parameters could reach.
     """
     simulator, readings = replays.simulator, replays.readings
-    starts, spent = replays.starts(point[None])
-    states, visited, before = starts[0], list[Float[np.ndarray, " d"]](), 0.0
+    visited, before = list[Float[np.ndarray, " d"]](), 0.0
     for _ in range(min(NEARBY_STEPS, replays.most_steps)):
         slopes = slopes_at(simulator, readings, point[None], states[None])[0]
         if not slopes.whole.any():
@@ -116,7 +121,7 @@ def _nearby_best(replays: FittedReplays, point: Float[np.ndarray, " d"]) -> tupl
         point = point + step
         visited.append(point)
     columns = 1 + 2 * len(point) + len(readings.spread)
-    spent += min(len(visited) + 1, NEARBY_STEPS) * columns * len(readings) * readings.steps
+    spent = min(len(visited) + 1, NEARBY_STEPS) * columns * len(readings) * readings.steps
     return np.array(visited[-_CANDIDATES:]).reshape(-1, len(point)), spent
 
 

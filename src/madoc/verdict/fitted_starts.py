@@ -25,8 +25,6 @@ AHEAD = (1, 5, 10)
 """Numbers of strides after the fitted ones at which errors are taken."""
 MOST = 150
 """Largest number of windows."""
-OVERLAPPING = 2
-"""Largest number of windows that share a row, on average: what more of them tell is what these tell."""
 FIT_STEPS = 10
 """Largest number of damped Gauss-Newton steps of an initial state, which begins at finite differences."""
 GAIN = 1e-3
@@ -77,13 +75,13 @@ class FittedReplays:
         return residuals[:, :, self.fitted + np.array(self.ahead)]
 
     def residuals(
-        self, points: Float[np.ndarray, "systems d"]
+        self, points: Float[np.ndarray, "systems d"], near: Float[np.ndarray, "windows state"] | None = None
     ) -> tuple[Float[np.ndarray, "systems windows readings channels"], int]:
         """Simulated minus measured observations of whole windows, and the control steps that were simulated.
 
-        They are in typical changes of a stride; NaN in a window whose simulation failed.
+        They are in typical changes of a stride; NaN in a window whose simulation failed. Initial states are `starts`.
         """
-        states, spent = self.starts(points)
+        states, spent = self.starts(points, near)
         spent += len(points) * len(self.readings) * self.readings.steps
         return self.residuals_from(points, states), spent
 
@@ -94,15 +92,21 @@ class FittedReplays:
         flat = self.readings.residuals(self.simulator, points, states)[:, 0]
         return flat.reshape(*flat.shape[:2], *self.readings.observed.shape[1:])
 
-    def starts(self, points: Float[np.ndarray, "systems d"]) -> tuple[Float[np.ndarray, "systems windows state"], int]:
+    def starts(
+        self, points: Float[np.ndarray, "systems d"], near: Float[np.ndarray, "windows state"] | None = None
+    ) -> tuple[Float[np.ndarray, "systems windows state"], int]:
         """The initial states from which each system comes nearest to the observations of the fitted steps.
 
-        Also the control steps that were simulated.
+        They are looked for around what an ensemble finds likely, or around those of a system that hardly differs, where
+        these are given as `near`. Also the control steps that were simulated.
         """
         whole = self.readings
         first = replace(whole, actions=whole.actions[:, : self.fitted], observed=whole.observed[:, : self.fitted + 1])
-        log = self.held, self.logged, self.simulator, first, self.rows
-        likely, spent = likely_states(*log, points, self.near)
+        if near is None:
+            log = self.held, self.logged, self.simulator, first, self.rows
+            likely, spent = likely_states(*log, points, self.near)
+        else:
+            likely, spent = np.repeat(near[None], len(points), axis=0), 0
         found = [self._fitted(first, point, states) for point, states in zip(points, likely, strict=True)]
         return np.stack([states for states, _ in found]), spent + sum(steps for _, steps in found)
 
@@ -159,7 +163,7 @@ def fitted_replays_of(
 ) -> FittedReplays | None:
     """Windows spread evenly over the hold-out; None where fewer than `fewest` are long enough.
 
-    They are at most `most`; without that `MOST`, which overlap no more than `OVERLAPPING` says but for the fewest.
+    They are at most `most`; without that `MOST`, and as many as share no row on average, or the fewest.
 
     `stride` is the number of control steps between readings at which the robot has moved, `data.timescale.stride`.
     `ahead` are control steps after the fitted ones, `AHEAD` strides where none are given.
@@ -171,7 +175,7 @@ def fitted_replays_of(
     possible = rows_that_fit(held, rows, steps)
     if len(possible) < fewest:
         return None
-    most = most or min(MOST, max(fewest, OVERLAPPING * len(possible) // steps))
+    most = most or min(MOST, max(fewest, len(possible) // steps))
     chosen = evenly(possible, most)
     readings = Readings.at(held, logged, rows[chosen], steps, scale)
     episodes = held.episode_of(rows[chosen])
