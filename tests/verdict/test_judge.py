@@ -280,17 +280,17 @@ def test_rows_alone_are_judged_by_the_classifier(word, before, after):
 @pytest.mark.parametrize("good", [PREDICTED, FITTED, TOLD_APART])
 def test_what_could_not_be_tested_or_stands_at_an_end_is_not_calibrated(good):
     untested = judge(replace(good, tested=False))
-    assert untested.word == "NOT_IDENTIFIABLE"
     why = "the log tells no states" if good is TOLD_APART else "whether the model lacks anything was not tested"
-    assert f", but {why}" in untested.sentence
+    assert untested.word == "NOT_IDENTIFIABLE" and f", but {why}" in untested.sentence
+    useful = replace(good, tested=False, open_loop=(predicted_over(1.0, 0.4, (0.3, 0.6)),))
+    assert good is TOLD_APART or judge(useful).word == "USABLE"
     assert judge(replace(good, at_end=("mass",))).word == "MODEL_MISMATCH"
 
 
 @EITHER
 def test_residuals_with_long_tails_are_a_mismatch(good):
     verdict = judge(good, unlike_noise=True)
-    assert verdict.word == "MODEL_MISMATCH"
-    assert verdict.sentence.startswith("residuals are unlike noise")
+    assert verdict.word == "MODEL_MISMATCH" and verdict.sentence.startswith("residuals are unlike noise")
 
 
 @EITHER

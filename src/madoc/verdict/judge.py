@@ -63,8 +63,8 @@ def judge(
 
     What the model lacks makes an estimate `USABLE` where it predicts much better than the model as given, and else a
     mismatch; one of a search that had not settled is `USABLE` there too, and else no improvement: what its log leaves
-    open is not known before. A log that is too short to tell whether the model lacks a term, or tells no states, leaves
-    its parameters open.
+    open is not known before. Where nothing told whether the model lacks a term, an
+    estimate is `USABLE` there as well, and else its parameters count as open.
 
     Args:
         holdout: What the hold-out says of the estimate.
@@ -188,7 +188,7 @@ def _untested(holdout: HoldOut) -> Verdict | None:
             "whether the model lacks anything was not tested: the log has too few windows that the model can follow, "
             "or the budget was too short; log more, or in longer runs, or give it more time"
         )
-    return Verdict("NOT_IDENTIFIABLE", f"{_how_good(holdout)}, but {why}")
+    return _not_certain(holdout, why)
 
 
 def _beyond_noise_later(holdout: HoldOut) -> Verdict | None:
