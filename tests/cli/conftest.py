@@ -1,14 +1,22 @@
+import os
+
 import pytest
 from command_line import WHOLE, WHOLE_CODE
+from filelock import FileLock
 
 from madoc.commands.main import main
 
 
 @pytest.fixture(scope="session")
 def whole(tmp_path_factory):
-    """The folder of one `madoc run`, shared by all tests: only read it, or copy it."""
-    folder = tmp_path_factory.mktemp("whole") / "run"
-    assert main([*WHOLE, "--out", str(folder)]) == WHOLE_CODE
+    """The folder of one `madoc run`, shared by all tests and all workers: only read it, or copy it."""
+    root = tmp_path_factory.getbasetemp()
+    root = root.parent if "PYTEST_XDIST_WORKER" in os.environ else root
+    folder, done = root / "whole" / "run", root / "whole-done"
+    with FileLock(root / "whole.lock"):
+        if not done.exists():
+            assert main([*WHOLE, "--out", str(folder)]) == WHOLE_CODE
+            done.touch()
     return folder
 
 
