@@ -9,11 +9,12 @@ import pytest
 from madoc import simulation
 from madoc.calibration import CalibrationProblem
 from madoc.calibration.least_squares.known_starts import KnownStarts
-from madoc.calibration.least_squares.plan import FIRST_DAMPING, TRIALS, Outcome, Plan
+from madoc.calibration.least_squares.plan import Outcome, Plan
 from madoc.calibration.least_squares.search import Search
 from madoc.calibration.least_squares.statistics import touched
 from madoc.calibration.least_squares.unknown_starts import UnknownStarts
 from madoc.data import Disturbance, disturb
+from madoc.identification.gauss_newton import FIRST_DAMPING, TRIALS
 from madoc.identification.losses import ALL_FAILED
 from madoc.identification.replay import window_residuals
 from madoc.identification.windows import windows_at

@@ -11,6 +11,7 @@ from madoc.calibration import CalibrationProblem
 from madoc.data import Disturbance, disturb
 from madoc.identification import settling
 from madoc.identification.ensembles import few_of, next_noise, with_contacts_settled
+from madoc.identification.gauss_newton import FIRST_DAMPING
 from madoc.identification.replay import Readings
 from madoc.identification.settling import (
     FAILED_WINDOW,
@@ -43,7 +44,7 @@ def logged_windows(task, truth, steps, noise, length=600):
 
 
 def descended(simulator, readings, guesses, point, widths):
-    states, damping, errors = guesses, np.full(len(guesses), settling.FIRST_DAMPING), np.zeros(len(readings.spread))
+    states, damping, errors = guesses, np.full(len(guesses), FIRST_DAMPING), np.zeros(len(readings.spread))
     for width in widths:
         after = settle(simulator, readings, point, states, damping, width * errors, "cauchy")
         states, damping, errors = after.states, after.damping, after.errors

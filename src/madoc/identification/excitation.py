@@ -16,8 +16,6 @@ SINGLE_STEPS, WINDOWS = 400, 64
 """Largest number of single steps, or of windows, that are differentiated; the result is scaled up to all rows."""
 _HARDLY_NARROWED = 0.25
 """Share in [0, 1] of the box's variance; above it the data has narrowed a direction by less than half."""
-_STATE_DAMPING = 1e-9
-"""Damping of initial states, relative to the squared lengths of the columns: less than the error of differences."""
 
 
 def expected_half_widths(
@@ -55,8 +53,7 @@ def expected_half_widths(
             spread_of(windows.states[:, : logged.physical_size]),
         )
         (around,) = slopes_at(simulator, readings, point[None], windows.states[None])
-        damping = np.full(len(windows), _STATE_DAMPING)
-        slopes = eliminate(around, np.ones_like(around.residuals), damping).reduced.jacobian
+        slopes = eliminate(around, np.ones_like(around.residuals)).reduced.jacobian
         columns = 1 + 2 * len(point) + logged.physical_size
         spent = columns * len(windows) * windows.steps
         share = len(dataset) / windows.steps / max(1, int(around.whole.sum()))

@@ -10,6 +10,8 @@ from madoc.data.dataset import Dataset
 from madoc.data.timescale import stride
 from madoc.identification.ensembles import with_contacts_settled
 from madoc.identification.gauss_newton import (
+    DAMPING,
+    LEAST_DAMPING,
     Eliminated,
     damped_step,
     eliminate,
@@ -45,10 +47,6 @@ GAIN = 0.01
 """Share of the cost that a step must remove for another one to follow."""
 LENGTHS = 4.0 ** -np.arange(4)
 """Lengths of a step that are tried, as shares in [0, 1] of the Gauss-Newton step."""
-_STATE_DAMPING = 1e-9
-"""Relative damping of initial states, far below the rounding of their differences."""
-_DAMPING = 1e-6
-"""Relative damping of a step of the parameters."""
 
 
 @dataclass(frozen=True)
@@ -235,7 +233,7 @@ def _sloped_by_parameters(simulator: Simulator, readings: Readings, fit: Fit) ->
 
 def _explicable(slopes: WindowSlopes) -> Float[np.ndarray, "windows values n"]:
     """Orthonormal columns that span what initial states explain of each window's residuals, to first order."""
-    basis, _ = states_basis(slopes.by_states, np.full(len(slopes.residuals), _STATE_DAMPING))
+    basis, _ = states_basis(slopes.by_states)
     return basis[:, : slopes.residuals.shape[1]]
 
 
@@ -259,8 +257,8 @@ def _stepped(simulator: Simulator, readings: Readings, fit: Fit) -> Fit:
     slopes = fit.slopes
     scale = scale_of(slopes.residuals[slopes.whole], "cauchy")
     weights = loss_slope((slopes.residuals / scale) ** 2, "cauchy") * slopes.whole[:, None]
-    left = _eliminated(slopes, weights)
-    whole_step = damped_step(*triangular_factors(left.reduced, 1.0, "linear"), fit.point, _DAMPING)
+    left = eliminate(slopes, weights)
+    whole_step = damped_step(*triangular_factors(left.reduced, 1.0, "linear"), fit.point, DAMPING)
     of_states = readings.in_state_units(left.states_step(whole_step), fit.states.shape[1])
     points = fit.point + LENGTHS[:, None] * whole_step
     states = fit.states + LENGTHS[:, None, None] * of_states
@@ -293,7 +291,7 @@ def _with_fitted_states(simulator: Simulator, readings: Readings, fit: Fit) -> F
         if not slopes.whole.any():
             break
         noise = _noise(fit.left, fit.spare, slopes.whole, readings)
-        scaled, damping = slopes.over(noise), np.full((1, len(states)), _STATE_DAMPING)
+        scaled, damping = slopes.over(noise), np.full((1, len(states)), LEAST_DAMPING)
         (step,) = states_steps(scaled.by_states, scaled.residuals, _weights(scaled), damping)
         moved = states + readings.in_state_units(step, states.shape[1])
         after = readings.residuals(simulator, fit.point[None], moved[None])[0, 0]
@@ -305,11 +303,6 @@ def _with_fitted_states(simulator: Simulator, readings: Readings, fit: Fit) -> F
         if before[better].sum() - now[better].sum() <= GAIN * before[slopes.whole].sum():
             break
     return fit
-
-
-def _eliminated(slopes: WindowSlopes, weights: Float[np.ndarray, "windows values"]) -> Eliminated:
-    """Residuals and derivatives without what initial states explain."""
-    return eliminate(slopes, weights, np.full(len(slopes.residuals), _STATE_DAMPING))
 
 
 @dataclass(frozen=True)
@@ -348,10 +341,9 @@ def reduced_of(slopes: WindowSlopes, readings: Readings, count: int) -> Reduced 
     kept = WindowSlopes(
         slopes.residuals[finite], slopes.by_parameters[finite], slopes.by_states[finite], slopes.whole[finite]
     )
-    left = left_by_states(kept, np.full(len(kept.residuals), _STATE_DAMPING))
-    noise = _noise(*left, kept.whole, readings)
+    noise = _noise(*left_by_states(kept), kept.whole, readings)
     scaled = kept.over(noise)
-    return Reduced(_eliminated(scaled, _weights(scaled)), noise, finite, count)
+    return Reduced(eliminate(scaled, _weights(scaled)), noise, finite, count)
 
 
 def products_of(slopes: WindowSlopes, readings: Readings, count: int) -> Products | None:

@@ -22,6 +22,14 @@ from madoc.simulation.base import Simulator
 
 BLOCK = 128
 """Number of rows of a block, larger than the number of columns of most problems."""
+FIRST_DAMPING = 1e-2
+"""Damping of the first step of a search, relative to the squared lengths of the columns."""
+TRIALS = (1e-2, 1.0, 1e2)
+"""Factors of the last damping that helped, which are tried at once."""
+DAMPING = 1e-6
+"""Relative damping of a step of the parameters near their minimum; 0 is none."""
+LEAST_DAMPING = 1e-9
+"""Relative damping of initial states that are only eliminated, far below the rounding of their differences."""
 
 
 def triangle(matrix: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "columns columns"]:
@@ -172,13 +180,15 @@ class Eliminated:
 
 
 def states_basis(
-    by_states: Float[np.ndarray, "windows values n"], damping: Float[np.ndarray, " windows"]
+    by_states: Float[np.ndarray, "windows values n"], damping: Float[np.ndarray, " windows"] | None = None
 ) -> tuple[Float[np.ndarray, "windows rows n"], Float[np.ndarray, "windows n n"]]:
     """Q and R of every window's derivatives by its initial state, with rows below for the damping √λ D.
 
-    What a window's initial state explains of its residuals is Q Qᵀ r, of which the first `values` rows are meant.
+    What a window's initial state explains of its residuals is Q Qᵀ r, of which the first `values` rows are meant. The
+    damping is `LEAST_DAMPING` where none is given.
     """
     windows, _, states = by_states.shape
+    damping = np.full(windows, LEAST_DAMPING) if damping is None else damping
     lengths = _lengths(np.linalg.norm(by_states, axis=1))
     damped = np.zeros((windows, states, states))
     damped[:, np.arange(states), np.arange(states)] = np.sqrt(damping)[:, None] * lengths
@@ -186,10 +196,10 @@ def states_basis(
 
 
 def left_by_states(
-    slopes: WindowSlopes, damping: Float[np.ndarray, " windows"]
+    slopes: WindowSlopes,
 ) -> tuple[Float[np.ndarray, "windows values"], Float[np.ndarray, "windows values"]]:
     """What initial states cannot explain of the residuals, and 1 - leverage of each value, as in `Eliminated`."""
-    basis = states_basis(slopes.by_states, damping)[0][:, : slopes.residuals.shape[1]]
+    basis = states_basis(slopes.by_states)[0][:, : slopes.residuals.shape[1]]
     within = np.swapaxes(basis, 1, 2) @ slopes.residuals[..., None]
     return slopes.residuals - (basis @ within)[..., 0], 1.0 - (basis**2).sum(-1)
 
@@ -202,7 +212,7 @@ def states_steps(
 ) -> Float[np.ndarray, "trials windows n"]:
     """Every window's step of its initial state alone, for each damping, as `Eliminated.states_step` of no parameters.
 
-    The normal equations are solved. A relative damping of 10^-9 or more, which they must have, bounds their condition,
+    The normal equations are solved. A damping of `LEAST_DAMPING` or more, which they must have, bounds their condition,
     so that a step is right to about 10^-5 of its length.
     """
     weighted = np.swapaxes(np.sqrt(weights)[..., None] * by_states, 1, 2)
@@ -212,11 +222,9 @@ def states_steps(
     return -np.linalg.solve(damped, (slope / lengths)[..., None])[..., 0] / lengths
 
 
-def states_errors(
-    by_states: Float[np.ndarray, "windows values n"], damping: Float[np.ndarray, " windows"]
-) -> Float[np.ndarray, "windows n"]:
+def states_errors(by_states: Float[np.ndarray, "windows values n"]) -> Float[np.ndarray, "windows n"]:
     """Standard errors of every window's initial state, for residuals in standard deviations of their noise."""
-    damped, lengths = _damped(np.swapaxes(by_states, 1, 2) @ by_states, damping)
+    damped, lengths = _damped(np.swapaxes(by_states, 1, 2) @ by_states, np.full(len(by_states), LEAST_DAMPING))
     return np.sqrt(np.diagonal(np.linalg.inv(damped), axis1=-2, axis2=-1)) / lengths
 
 
@@ -235,12 +243,14 @@ def _lengths(found: Float[np.ndarray, "windows n"]) -> Float[np.ndarray, "window
 
 
 def eliminate(
-    slopes: WindowSlopes, weights: Float[np.ndarray, "windows values"], damping: Float[np.ndarray, " windows"]
+    slopes: WindowSlopes,
+    weights: Float[np.ndarray, "windows values"],
+    damping: Float[np.ndarray, " windows"] | None = None,
 ) -> Eliminated:
     """Project every window's residuals and derivatives on what its initial state cannot explain.
 
     `weights` are those of the squared residuals. A window's state step p minimises ‖r + Js p‖² + λ ‖D p‖², with its
-    `damping` λ and the columns' lengths D.
+    `damping` λ, by default `LEAST_DAMPING`, and the columns' lengths D.
     """
     root = np.sqrt(weights)[..., None]
     basis, factor = states_basis(root * slopes.by_states, damping)

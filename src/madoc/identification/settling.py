@@ -12,7 +12,7 @@ from functools import cache
 import numpy as np
 from jaxtyping import Bool, Float
 
-from madoc.identification.gauss_newton import left_by_states, states_errors, states_steps
+from madoc.identification.gauss_newton import FIRST_DAMPING, TRIALS, left_by_states, states_errors, states_steps
 from madoc.identification.linearisation import DIFFERENCE, WindowSlopes
 from madoc.identification.losses import TUNING, Loss, loss_slope, loss_value
 from madoc.identification.noise import channel_noise
@@ -35,16 +35,10 @@ WORTH_MORE = 0.1
 follow."""
 FEW = 0.01
 """Share in [0, 1] of the windows whose residuals are more than noise, up to which nothing further is tried."""
-TRIALS = (1e-2, 1.0, 1e2)
-"""Factors of the last damping that helped, tried at once; where none helps, it is multiplied by the last."""
-FIRST_DAMPING = 1e-2
-"""Damping of the first step, relative to the squared lengths of the columns."""
 DAMPING_RANGE = (1e-9, 1e6)
 """Smallest and largest relative damping of an initial state's step; it is clipped to them."""
 WIDE_DAMPING = 1.0
 """Largest relative damping after a step by wide differences, as the next ones are of other slopes."""
-LEAST_DAMPING = 1e-9
-"""Damping of an initial state where only its covariance is computed, relative to the squared lengths of the columns."""
 FAILED_WINDOW = 1e6
 """Cost of a window whose simulation failed, in squared standard deviations of the noise; no cost is larger."""
 
@@ -226,10 +220,10 @@ def _noise_and_errors(
     slopes: WindowSlopes, readings: Readings
 ) -> tuple[Float[np.ndarray, " channels"], Float[np.ndarray, " physical"]]:
     """Noise of each channel by what initial states cannot explain, and the states' standard errors that follow."""
-    least, whole = np.full(len(readings), LEAST_DAMPING), slopes.whole
-    left = (part.reshape(-1, *readings.observed.shape[1:])[whole] for part in left_by_states(slopes, least))
+    whole = slopes.whole
+    left = (part.reshape(-1, *readings.observed.shape[1:])[whole] for part in left_by_states(slopes))
     deviation = channel_noise(*left)
     if not whole.any():
         return deviation, np.zeros(len(readings.spread))
-    errors = states_errors(slopes.by_states[whole] / np.tile(deviation, readings.steps + 1)[:, None], least[whole])
+    errors = states_errors(slopes.by_states[whole] / np.tile(deviation, readings.steps + 1)[:, None])
     return deviation, np.minimum(np.median(errors, axis=0), 1.0)

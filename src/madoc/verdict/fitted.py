@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from madoc.calibration.holdout import AgainstChance, Fitted
 from madoc.data import stride
-from madoc.identification.gauss_newton import damped_step, eliminate, triangular_factors
+from madoc.identification.gauss_newton import DAMPING, damped_step, eliminate, triangular_factors
 from madoc.identification.losses import curvature_share, loss_slope, scale_of
 from madoc.identification.noise import residual_noise
 from madoc.identification.replay import slopes_at
@@ -27,8 +27,6 @@ GAIN = 0.01
 """Share in (0, 1) by which a step has to change the residuals' scale for another one to follow."""
 _CANDIDATES = 2
 """Number of last points whose predictions are compared: an earlier one may be better where the last went too far."""
-_DAMPING = 1e-6
-"""Marquardt's damping of a step, relative to the squared lengths of the columns; 0 is none."""
 
 
 def fitted(
@@ -115,8 +113,8 @@ def _nearby_best(
         before = scale
         z = (slopes.residuals / scale) ** 2
         newton = slopes.curved(curvature_share(z[slopes.whole], "cauchy"))
-        eliminated = eliminate(newton, loss_slope(z, "cauchy"), np.full(len(readings), _DAMPING))
-        step = damped_step(*triangular_factors(eliminated.reduced, 1.0, "linear"), point, _DAMPING)
+        eliminated = eliminate(newton, loss_slope(z, "cauchy"), np.full(len(readings), DAMPING))
+        step = damped_step(*triangular_factors(eliminated.reduced, 1.0, "linear"), point, DAMPING)
         states = states + readings.in_state_units(eliminated.states_step(step), states.shape[1])
         point = point + step
         visited.append(point)

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from madoc.data import Dataset
 from madoc.identification.ensembles import likely_states
-from madoc.identification.gauss_newton import states_steps
+from madoc.identification.gauss_newton import LEAST_DAMPING, states_steps
 from madoc.identification.replay import Readings, slopes_at
 from madoc.identification.states import LoggedStates, states_of
 from madoc.identification.windows import evenly, rows_that_fit
@@ -35,8 +35,6 @@ _SHARES = np.array([1.0, 0.3, 0.1])
 """Shares in (0, 1] of a step, of which every window takes the one that fits it best; none where none does."""
 _POINTS, _NEARBY_STEPS = 6, 6
 """Number of points at which starts are fitted, and of Gauss-Newton steps of the parameters beside them."""
-_DAMPING = 1e-8
-"""Damping of an initial state's step, relative to the squared lengths of the columns; 0 is none."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +119,7 @@ class FittedReplays:
         for _ in range(self.most_steps):
             part, around = first.of(gaining), states[gaining]
             (slopes,) = slopes_at(self.simulator, part, point[None], around[None], parameters=False)
-            damping, alike = np.full((1, len(part)), _DAMPING), np.ones_like(slopes.residuals)
+            damping, alike = np.full((1, len(part)), LEAST_DAMPING), np.ones_like(slopes.residuals)
             (moved,) = states_steps(slopes.by_states, slopes.residuals, alike, damping)
             step = first.in_state_units(moved * ~self.logged.in_plane, states.shape[1])
             tried = around + _SHARES[:, None, None] * step

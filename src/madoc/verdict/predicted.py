@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from madoc.calibration.holdout import Predicted, PredictionErrors
 from madoc.data import stride
 from madoc.identification import noise as sensors
-from madoc.identification.gauss_newton import descend
+from madoc.identification.gauss_newton import DAMPING, descend
 from madoc.identification.states import logged_states
 from madoc.identification.windows import consecutive_rows, evenly
 from madoc.simulation.attitudes import differences
@@ -29,8 +29,6 @@ from madoc.verdict.systematic import EXPLAINED, autocorrelation, explained, expl
 
 WHOLE_STEPS = 3
 """Number of Gauss-Newton steps on whole windows, at least 1; they begin at the minimum of single steps."""
-_DAMPING = 1e-6
-"""Marquardt's damping of a step, relative to the squared lengths of the columns; 0 is none."""
 MOST_ROWS = 4000
 """Largest number of held-out rows whose residuals are compared with those of later rows."""
 TOUCHING = 0.1
@@ -205,7 +203,7 @@ def _explained_at_end(
     if share <= EXPLAINED or interval is None:
         return share, 0
     _, visited, spent = descend(
-        replays.simulator, replays.windows, best, replays.scale, steps=WHOLE_STEPS, loss="cauchy", damping=_DAMPING
+        replays.simulator, replays.windows, best, replays.scale, steps=WHOLE_STEPS, loss="cauchy", damping=DAMPING
     )
     if not len(visited):
         return share, spent

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from madoc.data import Dataset
-from madoc.identification.gauss_newton import descend
+from madoc.identification.gauss_newton import DAMPING, descend
 from madoc.identification.replay import window_residuals
 from madoc.identification.states import logged_states, states_observed_as
 from madoc.identification.windows import Windows, evenly, rows_that_fit, windows_at
@@ -23,8 +23,6 @@ NEARBY_STEPS = 8
 """Largest number of Gauss-Newton steps from an estimate: enough to reach the nearest local minimum."""
 _STILL = 1e-7
 """Largest component in [-1, 1] of a step; the search ends after a smaller one."""
-_DAMPING = 1e-6
-"""Marquardt's damping of a step, relative to the squared lengths of the columns; 0 is none."""
 _CANDIDATES = 2
 """Number of last points whose errors are compared over all horizons: the last step may have left the minimum."""
 
@@ -167,7 +165,7 @@ def nearby_best(replays: Replays, point: Float[np.ndarray, " d"]) -> tuple[Float
         replays.scale,
         steps=NEARBY_STEPS,
         loss="cauchy",
-        damping=_DAMPING,
+        damping=DAMPING,
         shortest=_STILL,
     )
     return visited[-_CANDIDATES:], spent

@@ -24,11 +24,11 @@ from madoc.calibration.least_squares.instruments import (
     products_of,
     shares_of,
 )
-from madoc.calibration.least_squares.plan import FEWEST, FIRST_DAMPING, TRIALS, Found
+from madoc.calibration.least_squares.plan import FEWEST, Found
 from madoc.calibration.least_squares.statistics import LONG_TAILS, touched
 from madoc.data import stride
 from madoc.identification.ensembles import Innovations, first_counted, innovations, next_noise, with_noise
-from madoc.identification.gauss_newton import damped_step
+from madoc.identification.gauss_newton import FIRST_DAMPING, TRIALS, damped_step
 from madoc.identification.information import sandwich
 from madoc.identification.losses import Loss
 from madoc.identification.noise import WHITE

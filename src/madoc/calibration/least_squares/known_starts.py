@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from madoc.calibration.base import CalibrationProblem
-from madoc.calibration.least_squares.plan import TRIALS, Outcome, Plan
+from madoc.calibration.least_squares.plan import Outcome, Plan
 from madoc.errors import MadocError
-from madoc.identification.gauss_newton import damped_step, triangular_factors
+from madoc.identification.gauss_newton import TRIALS, damped_step, triangular_factors
 from madoc.identification.information import bread, meat
 from madoc.identification.linearisation import difference_points, linearise
 from madoc.identification.losses import ALL_FAILED, Loss, mean_cost, robust_deviation, scale_of

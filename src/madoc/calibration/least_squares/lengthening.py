@@ -15,12 +15,13 @@ from jaxtyping import Float, Int
 
 from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.filtering import FilterState
-from madoc.calibration.least_squares.plan import FEWEST, FIRST_DAMPING
+from madoc.calibration.least_squares.plan import FEWEST
 from madoc.calibration.least_squares.predicting import Prediction
 from madoc.calibration.least_squares.search import SearchState
 from madoc.calibration.least_squares.statistics import touched
 from madoc.data import Dataset
 from madoc.identification.ensembles import likely_states
+from madoc.identification.gauss_newton import FIRST_DAMPING
 from madoc.identification.information import half_width, sandwich
 from madoc.identification.replay import Readings
 from madoc.identification.settling import FAILED_WINDOW, RESETTLING, settled, settled_to_noise

@@ -5,13 +5,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
+from madoc.identification.gauss_newton import TRIALS
 from madoc.identification.information import Uncertainty
 from madoc.identification.losses import ALL_FAILED
 
-TRIALS = (1e-2, 1.0, 1e2)
-"""Factors of the last damping that helped, tried at once; where none helps, the damping is multiplied by a thousand."""
-FIRST_DAMPING = 1e-2
-"""Damping of the first steps, relative to the squared lengths of the columns; 0 is none."""
 FEWEST = 5
 """Smallest number of windows beyond that of parameters; with fewer, Student's t would widen the intervals much."""
 _SMALLEST = 1e-100

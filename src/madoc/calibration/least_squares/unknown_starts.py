@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from madoc.calibration.base import CalibrationProblem
-from madoc.calibration.least_squares.plan import TRIALS, Outcome, Plan
+from madoc.calibration.least_squares.plan import Outcome, Plan
 from madoc.calibration.least_squares.statistics import (
     autocorrelation,
     clipped_change,
@@ -18,13 +18,13 @@ from madoc.calibration.least_squares.statistics import (
     outlier_limits,
 )
 from madoc.errors import MadocError
-from madoc.identification.gauss_newton import damped_step, eliminate, left_by_states, triangular_factors
+from madoc.identification.gauss_newton import TRIALS, damped_step, eliminate, left_by_states, triangular_factors
 from madoc.identification.information import at_least_noise, bread, jackknife_meat, least_share
 from madoc.identification.linearisation import WindowSlopes
 from madoc.identification.losses import TUNING, Loss, curvature_share, loss_slope
 from madoc.identification.noise import channel_noise
 from madoc.identification.replay import Readings, slopes_at
-from madoc.identification.settling import FAILED_WINDOW, LEAST_DAMPING, Settled, settle, window_costs
+from madoc.identification.settling import FAILED_WINDOW, Settled, settle, window_costs
 from madoc.identification.windows import disjoint_windows
 from madoc.simulation.base import Simulator
 
@@ -203,8 +203,7 @@ class UnknownStarts:
         refining: bool,
     ) -> Plan:
         """The plan of one search; once it refines, channels are weighted by noise and untrusted windows left out."""
-        least = np.full(len(state_damping), LEAST_DAMPING)
-        spare = left_by_states(slopes, least)[1]
+        spare = left_by_states(slopes)[1]
         kept, deviation = self._weighted(slopes, spare, refining=refining)
         slopes = slopes.over(np.tile(deviation, self.readings.steps + 1))
         z = (slopes.residuals / TUNING[self.loss]) ** 2
@@ -213,7 +212,7 @@ class UnknownStarts:
         damped = eliminate(slopes.curved(share), weights, state_damping)
         factors = triangular_factors(damped.reduced.where(kept), 1.0, "linear")
         steps = [*(damped_step(*factors, point, damping * trial) for trial in TRIALS), np.zeros_like(point)]
-        exact = eliminate(slopes, weights, least).reduced.of(kept)
+        exact = eliminate(slopes, weights).reduced.of(kept)
         curved = share * bread(exact, 1.0, "linear")
         freedom = float(spare[kept].sum()) - len(point)
         ratio = noise_ratio(slopes.residuals[kept], weights[kept], share, freedom)
@@ -272,5 +271,5 @@ class UnknownStarts:
         middle, reach = outlier_limits(costs[whole], self.readings.activity[whole])
         kept = whole & (costs <= np.maximum(middle + reach, UNLIKE_NOISE))
         weights = loss_slope((slopes.residuals / TUNING[self.loss]) ** 2, self.loss)
-        reduced = eliminate(slopes, weights, np.full(len(whole), LEAST_DAMPING)).reduced
+        reduced = eliminate(slopes, weights).reduced
         return kept if least_share(reduced.of(kept), reduced.of(whole)) > _SUFFICIENT else whole
