@@ -85,9 +85,11 @@ def test_fitted_predictions_are_as_good_as_those_of_an_imitated_hold_out_where_t
     assert max(max(each.beside_noise.values()) for each in right) < 1.3
     # An estimate 5 % of a range off is 20 times as far off as it is said to be, and as far as it is said to be.
     wrong = open_loop(bench, point + 0.1, fits_starts=True, covariance=25.0 * covariance)
-    assert max(wrong[-1].beside_noise.values()) > ABOVE_NOISE
+    assert max(wrong[-1].beside_noise.values()) > ABOVE_NOISE and wrong[-1].whole
+    assert max(wrong[-2].beside_noise.values()) > BEYOND_RANDOM
     unsure = open_loop(bench, point + 0.1, fits_starts=True, covariance=1e-2 * np.eye(len(point)))
     assert max(unsure[-1].beside_noise.values()) < ABOVE_NOISE
+    assert max(max(each.beside_noise.values()) for each in unsure[:-1]) < BEYOND_RANDOM
     assert not open_loop(bench, point, covariance=covariance)[0].beside_noise  # from logged states, of unknown noise
 
 

@@ -192,12 +192,16 @@ def _untested(holdout: HoldOut) -> Verdict | None:
 
 
 def _beyond_noise_later(holdout: HoldOut) -> Verdict | None:
-    """What no test of single terms finds, and yet is in predictions over a longer time."""
-    enough = [each for each in holdout.open_loop if each.windows >= FEWEST_GROUPS]
-    beside = [(ratio, name, each.seconds) for each in enough for name, ratio in each.beside_noise.items()]
-    ratio, name, seconds = max(beside, default=(0.0, "", 0.0))
-    if ratio <= (BEYOND_RANDOM if isinstance(holdout, Predicted) else ABOVE_NOISE) or numerical(holdout) is not None:
+    """What no test of single terms finds, and yet is in predictions over a longer time; whole runs are few."""
+    beside = [
+        (ratio, name, each.seconds)
+        for each in holdout.open_loop
+        for name, ratio in each.beside_noise.items()
+        if each.windows >= FEWEST_GROUPS and ratio > (ABOVE_NOISE if each.whole else BEYOND_RANDOM)
+    ]
+    if not beside or numerical(holdout) is not None:
         return None
+    ratio, name, seconds = max(beside)
     return _not_certain(
         holdout,
         f"the model lacks something that no test finds: over {seconds:.3g} s it predicts {name} with {ratio:.2g} times "
