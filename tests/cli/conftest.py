@@ -1,4 +1,5 @@
 import os
+import shutil
 
 import pytest
 from command_line import WHOLE, WHOLE_CODE
@@ -15,6 +16,7 @@ def whole(tmp_path_factory):
     folder, done = root / "whole" / "run", root / "whole-done"
     with FileLock(root / "whole.lock"):
         if not done.exists():
+            shutil.rmtree(folder, ignore_errors=True)
             assert main([*WHOLE, "--out", str(folder)]) == WHOLE_CODE
             done.touch()
     return folder

@@ -8,6 +8,8 @@ from planted_logs import ROBOTS, bench, log_of
 
 from madoc import simulation
 from madoc.data import Disturbance, disturb, hide_velocities
+from madoc.identification.linearisation import WindowSlopes
+from madoc.verdict import fitted
 from madoc.verdict.bench import FEWEST_FITTED
 from madoc.verdict.fitted_starts import fitted_replays_of, replay_steps
 
@@ -35,10 +37,31 @@ def test_fits_end_where_steps_gain_little():
     assert replace(replays, most_steps=1).starts(AT_TRUTH)[1] == of_a_step
     residuals, whole = replays.residuals(AT_TRUTH)
     assert whole == spent + len(replays.readings) * replays.readings.steps
-    fitted, ahead = residuals[0, :, : replays.fitted + 1], residuals[0, :, replays.fitted + 1 :]
+    first, ahead = residuals[0, :, : replays.fitted + 1], residuals[0, :, replays.fitted + 1 :]
     assert (
-        0.3 < fitted.std() / ahead.std() < 1.0
+        0.3 < first.std() / ahead.std() < 1.0
     )  # noise alone is left of the one, errors of the state grow in the other
+
+
+def test_starts_near_those_of_another_system_are_as_good_and_no_better():
+    replays, point = replays_under(0.2), AT_TRUTH + 0.01
+    states, _ = replays.starts(AT_TRUTH)
+    (alone, spent), (near, fewer) = replays.starts(point), replays.starts(point, states[0])
+    left = [np.square(replays.residuals_from(point, each)[0, :, : replays.fitted + 1]).sum() for each in (alone, near)]
+    np.testing.assert_allclose(left[1], left[0], rtol=1e-3)
+    assert fewer < spent
+    hurried = replace(replays, most_steps=1)  # more steps would be an advantage over the other system
+    np.testing.assert_array_equal(hurried.starts(point, states[0])[0], hurried.starts(point)[0])
+
+
+def test_the_best_nearby_is_the_estimate_where_every_simulation_fails(monkeypatch):
+    replays = replays_under(0.2)
+    windows = len(replays.readings)
+    parts = np.zeros((windows, 1)), np.zeros((windows, 1, 1)), np.zeros((windows, 1, 1))
+    failed = WindowSlopes(*parts, whole=np.zeros(windows, dtype=bool))
+    monkeypatch.setattr(fitted, "slopes_at", lambda *_: [failed])
+    points, _ = fitted._nearby_best(replays, AT_TRUTH[0], replays.near)
+    np.testing.assert_array_equal(points, AT_TRUTH)
 
 
 def test_starts_take_fewer_steps_where_time_is_short(monkeypatch):
@@ -54,7 +77,7 @@ def test_the_hold_out_leaves_time_for_tests_of_the_model(monkeypatch):
     to_test = judged.windows_to_test * replace(judged, rate=1.0).window_seconds  # control steps
     columns = replay_steps(judged.states, 1, len(ARM.parameters))
     shares = ((0.3, 0.4), (0.65, 0.35), (1.5, 0.1))  # of the time left for tests, and then for the hold-out
-    for share, fitted in shares:
+    for share, of_hold_out in shares:
         timed = replace(judged, rate=to_test / share / 10.0)
-        affordable = int(fitted * timed.rate * 10.0 / columns)
+        affordable = int(of_hold_out * timed.rate * 10.0 / columns)
         assert len(timed.fitted.rows) == min(len(judged.fittable.rows), max(FEWEST_FITTED, affordable))

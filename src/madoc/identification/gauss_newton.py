@@ -27,9 +27,9 @@ FIRST_DAMPING = 1e-2
 TRIALS = (1e-2, 1.0, 1e2)
 """Factors of the last damping that helped, which are tried at once."""
 DAMPING = 1e-6
-"""Relative damping of a step of the parameters near their minimum; 0 is none."""
+"""Relative damping of a step near the minimum; 0 is none."""
 LEAST_DAMPING = 1e-9
-"""Relative damping of initial states that are only eliminated, far below the rounding of their differences."""
+"""Relative damping of initial states whose steps need none, far below the rounding of their differences."""
 
 
 def triangle(matrix: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "columns columns"]:
@@ -180,18 +180,16 @@ class Eliminated:
 
 
 def states_basis(
-    by_states: Float[np.ndarray, "windows values n"], damping: Float[np.ndarray, " windows"] | None = None
+    by_states: Float[np.ndarray, "windows values n"], damping: Float[np.ndarray, " windows"] | float = LEAST_DAMPING
 ) -> tuple[Float[np.ndarray, "windows rows n"], Float[np.ndarray, "windows n n"]]:
     """Q and R of every window's derivatives by its initial state, with rows below for the damping √λ D.
 
-    What a window's initial state explains of its residuals is Q Qᵀ r, of which the first `values` rows are meant. The
-    damping is `LEAST_DAMPING` where none is given.
+    What a window's initial state explains of its residuals is Q Qᵀ r, of which the first `values` rows are meant.
     """
     windows, _, states = by_states.shape
-    damping = np.full(windows, LEAST_DAMPING) if damping is None else damping
     lengths = _lengths(np.linalg.norm(by_states, axis=1))
     damped = np.zeros((windows, states, states))
-    damped[:, np.arange(states), np.arange(states)] = np.sqrt(damping)[:, None] * lengths
+    damped[:, np.arange(states), np.arange(states)] = np.sqrt(np.broadcast_to(damping, windows))[:, None] * lengths
     return thin_qr(np.concatenate([by_states, damped], axis=1))
 
 
@@ -245,12 +243,12 @@ def _lengths(found: Float[np.ndarray, "windows n"]) -> Float[np.ndarray, "window
 def eliminate(
     slopes: WindowSlopes,
     weights: Float[np.ndarray, "windows values"],
-    damping: Float[np.ndarray, " windows"] | None = None,
+    damping: Float[np.ndarray, " windows"] | float = LEAST_DAMPING,
 ) -> Eliminated:
     """Project every window's residuals and derivatives on what its initial state cannot explain.
 
     `weights` are those of the squared residuals. A window's state step p minimises ‖r + Js p‖² + λ ‖D p‖², with its
-    `damping` λ, by default `LEAST_DAMPING`, and the columns' lengths D.
+    `damping` λ and the columns' lengths D.
     """
     root = np.sqrt(weights)[..., None]
     basis, factor = states_basis(root * slopes.by_states, damping)

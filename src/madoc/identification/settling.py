@@ -12,7 +12,14 @@ from functools import cache
 import numpy as np
 from jaxtyping import Bool, Float
 
-from madoc.identification.gauss_newton import FIRST_DAMPING, TRIALS, left_by_states, states_errors, states_steps
+from madoc.identification.gauss_newton import (
+    FIRST_DAMPING,
+    LEAST_DAMPING,
+    TRIALS,
+    left_by_states,
+    states_errors,
+    states_steps,
+)
 from madoc.identification.linearisation import DIFFERENCE, WindowSlopes
 from madoc.identification.losses import TUNING, Loss, loss_slope, loss_value
 from madoc.identification.noise import channel_noise
@@ -90,7 +97,8 @@ def settle(
     deviation, errors = _noise_and_errors(slopes, readings)
     scaled = slopes.over(np.tile(deviation, readings.steps + 1))
     weights = loss_slope((scaled.residuals / TUNING[loss]) ** 2, loss) * scaled.whole[:, None]
-    steps = states_steps(scaled.by_states, scaled.residuals, weights, np.array(TRIALS)[:, None] * damping)
+    tried = np.maximum(np.array(TRIALS)[:, None] * damping, LEAST_DAMPING)
+    steps = states_steps(scaled.by_states, scaled.residuals, weights, tried)
     moved = states + readings.in_state_units(steps, states.shape[1])
     after = readings.residuals(simulator, point[None], moved.reshape(1, -1, states.shape[1]))[0]
     whole = np.where(slopes.whole[:, None], slopes.residuals, np.nan)

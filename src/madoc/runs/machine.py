@@ -28,7 +28,7 @@ def keep_to_core(core: int) -> None:
 
 @contextlib.contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """Products of matrices on one thread: the same bits on any number of cores.
+    """Products of matrices in this process on one thread: the same bits on any number of cores.
 
     Those of windows are small. A second thread saves little of their time, and costs several times as much where it
     has to wait for a core. It is a decorator too.

@@ -113,14 +113,14 @@ def _nearby_best(
         before = scale
         z = (slopes.residuals / scale) ** 2
         newton = slopes.curved(curvature_share(z[slopes.whole], "cauchy"))
-        eliminated = eliminate(newton, loss_slope(z, "cauchy"), np.full(len(readings), DAMPING))
+        eliminated = eliminate(newton, loss_slope(z, "cauchy"), DAMPING)
         step = damped_step(*triangular_factors(eliminated.reduced, 1.0, "linear"), point, DAMPING)
         states = states + readings.in_state_units(eliminated.states_step(step), states.shape[1])
         point = point + step
         visited.append(point)
     columns = 1 + 2 * len(point) + len(readings.spread)
-    spent = min(len(visited) + 1, NEARBY_STEPS) * columns * len(readings) * readings.steps
-    return np.array(visited[-_CANDIDATES:]).reshape(-1, len(point)), spent
+    spent = min(len(visited) + 1, NEARBY_STEPS, replays.most_steps) * columns * len(readings) * readings.steps
+    return np.array(visited[-_CANDIDATES:] or [point]), spent
 
 
 def _against_chance(replays: FittedReplays, residuals: Float[np.ndarray, "windows readings channels"]) -> AgainstChance:

@@ -33,7 +33,7 @@ FEW = 0.01
 """Share in [0, 1] of the windows, up to which no further step is taken for those that a step gained on."""
 _SHARES = np.array([1.0, 0.3, 0.1])
 """Shares in (0, 1] of a step, of which every window takes the one that fits it best; none where none does."""
-_POINTS, _NEARBY_STEPS = 6, 6
+_POINTS, _NEARBY_STEPS = 5, 6
 """Number of points at which starts are fitted, and of Gauss-Newton steps of the parameters beside them."""
 
 
@@ -96,11 +96,12 @@ class FittedReplays:
         """The initial states from which each system comes nearest to the observations of the fitted steps.
 
         They are looked for around what an ensemble finds likely, or around those of a system that hardly differs, where
-        these are given as `near`. Also the control steps that were simulated.
+        these are given as `near`: unless steps were too few to find them, so that none has more steps than another.
+        Also the control steps that were simulated.
         """
         whole = self.readings
         first = replace(whole, actions=whole.actions[:, : self.fitted], observed=whole.observed[:, : self.fitted + 1])
-        if near is None:
+        if near is None or self.most_steps < FIT_STEPS:
             log = self.held, self.logged, self.simulator, first, self.rows
             likely, spent = likely_states(*log, points, self.near)
         else:

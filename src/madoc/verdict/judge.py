@@ -63,8 +63,8 @@ def judge(
 
     What the model lacks makes an estimate `USABLE` where it predicts much better than the model as given, and else a
     mismatch; one of a search that had not settled is `USABLE` there too, and else no improvement: what its log leaves
-    open is not known before. Where nothing told whether the model lacks a term, an
-    estimate is `USABLE` there as well, and else its parameters count as open.
+    open is not known before. Where nothing told whether the model lacks a term, an estimate is `USABLE` there as well,
+    and else its parameters count as open.
 
     Args:
         holdout: What the hold-out says of the estimate.

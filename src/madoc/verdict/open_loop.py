@@ -188,7 +188,7 @@ def _from_fitted(
 ) -> tuple[Float[np.ndarray, "models windows steps channels"], Int[np.ndarray, " windows"]] | None:
     """The same from starts that are fitted under each model to the strides before, and of the imitated hold-out."""
     moving, of_models, rows = stride(bench.problem.dataset), [], np.empty(0, np.int64)
-    of_window = replay_steps(bench.states, moving, 0) * 2 // 3 + (4 + IMITATED) * steps
+    of_window = replay_steps(bench.states, moving, 0) * 4 // 5 + (4 + IMITATED) * steps
     most = bench.windows_in_time(of_window, SHARE, MOST)
     most_steps = bench.steps_in_time(most * of_window)
     for simulator, points in _models(bench, given, point):

@@ -92,11 +92,10 @@ def _doubts(
     left = felt(fine.terms)
     if not fine.tested or (left is not None and left.explained >= NUMERICAL):
         return replace(doubts, control_steps=spent), False
-    others = [*doubts.alternatives]
-    others += [
+    others = [
         replace(each, causes=(INTEGRATION,)) if each.causes == (OTHER_WINDOWS,) else each for each in fine.alternatives
     ]
-    others += of_small_terms(fine.terms, worth_naming(step))
+    others = [*doubts.alternatives, *others, *of_small_terms(fine.terms, worth_naming(step))]
     terms = step, *(term for term in fine.terms if term.cause != INTEGRATION)
     return replace(fine, terms=terms, alternatives=tuple(others), control_steps=spent), True
 
