@@ -60,7 +60,7 @@ def test_what_a_state_explains_is_taken_out():
     found = eliminate(slopes, np.ones((1, 2)), NOTHING)
     np.testing.assert_allclose(found.reduced.residuals[0, :2], [1.0, -1.0], atol=1e-12)
     np.testing.assert_allclose(found.reduced.jacobian[0, :2], [[0.5, 0.0], [-0.5, 0.0]], atol=1e-12)
-    np.testing.assert_allclose(found.spare, [[0.5, 0.5]], atol=1e-12)
+    np.testing.assert_allclose(left_by_states(slopes)[1], [[0.5, 0.5]], atol=1e-9)
     # The state makes up for the mean of the residuals, 2, and for what the parameters' step has moved it by.
     np.testing.assert_allclose(found.states_step(np.zeros(2)), [[-2.0]], atol=1e-12)
     np.testing.assert_allclose(found.states_step(np.array([1.0, 1.0])), [[-4.5]], atol=1e-12)
@@ -111,13 +111,13 @@ def test_states_alone_are_stepped_and_left_out_as_beside_parameters(damping):
     slopes = slopes_of(random.standard_normal((3, 50)), np.zeros((3, 50, 0)), by_states)
     weights, each = random.uniform(0.5, 2.0, (3, 50)), np.full(3, damping)
     wanted = eliminate(slopes, weights, each)
-    steps = states_steps(slopes.by_states, slopes.residuals, weights, np.stack([each, 1e3 * each]))
+    steps = states_steps(slopes, weights, np.stack([each, 1e3 * each]))
     np.testing.assert_allclose(steps[0], wanted.states_step(np.zeros(0)), rtol=1e-4)
     np.testing.assert_allclose(steps[1], eliminate(slopes, weights, 1e3 * each).states_step(np.zeros(0)), rtol=1e-4)
     alike = eliminate(slopes, np.ones((3, 50)))
     left, spare = left_by_states(slopes)
     np.testing.assert_allclose(left, alike.reduced.residuals[:, :50], atol=1e-12)
-    np.testing.assert_allclose(spare, alike.spare, atol=1e-12)
+    np.testing.assert_allclose(spare, 1.0 - (alike.basis[:, :50] ** 2).sum(-1), atol=1e-12)
 
 
 def test_the_error_of_a_state_that_two_readings_show():

@@ -292,7 +292,7 @@ def _with_fitted_states(simulator: Simulator, readings: Readings, fit: Fit) -> F
             break
         noise = _noise(fit.left, fit.spare, slopes.whole, readings)
         scaled, damping = slopes.over(noise), np.full((1, len(states)), LEAST_DAMPING)
-        (step,) = states_steps(scaled.by_states, scaled.residuals, _weights(scaled), damping)
+        (step,) = states_steps(scaled, _weights(scaled), damping)
         moved = states + readings.in_state_units(step, states.shape[1])
         after = readings.residuals(simulator, fit.point[None], moved[None])[0, 0]
         before, now = _costs(scaled.residuals), _costs(after / noise)

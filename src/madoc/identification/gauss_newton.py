@@ -155,14 +155,12 @@ class Eliminated:
 
     Attributes:
         reduced: Weighted residuals and derivatives, projected on what no initial state of their window can explain.
-        spare: 1 - leverage of each value: the share of its noise that its window's initial state does not absorb.
         response: R⁻¹ Qᵀ (r, Jθ), from which `states_step` is computed.
         basis: Q, with the rows of the damping below.
         root: Square roots of the weights.
     """
 
     reduced: Linearisation
-    spare: Float[np.ndarray, "windows values"]
     response: Float[np.ndarray, "windows n columns"]
     basis: Float[np.ndarray, "windows rows n"]
     root: Float[np.ndarray, "windows values 1"]
@@ -196,15 +194,14 @@ def states_basis(
 def left_by_states(
     slopes: WindowSlopes,
 ) -> tuple[Float[np.ndarray, "windows values"], Float[np.ndarray, "windows values"]]:
-    """What initial states cannot explain of the residuals, and 1 - leverage of each value, as in `Eliminated`."""
+    """What initial states cannot explain of the residuals, and 1 - leverage: the share of noise that they leave."""
     basis = states_basis(slopes.by_states)[0][:, : slopes.residuals.shape[1]]
     within = np.swapaxes(basis, 1, 2) @ slopes.residuals[..., None]
     return slopes.residuals - (basis @ within)[..., 0], 1.0 - (basis**2).sum(-1)
 
 
 def states_steps(
-    by_states: Float[np.ndarray, "windows values n"],
-    residuals: Float[np.ndarray, "windows values"],
+    slopes: WindowSlopes,
     weights: Float[np.ndarray, "windows values"],
     dampings: Float[np.ndarray, "trials windows"],
 ) -> Float[np.ndarray, "trials windows n"]:
@@ -213,9 +210,9 @@ def states_steps(
     The normal equations are solved. A damping of `LEAST_DAMPING` or more, which they must have, bounds their condition,
     so that a step is right to about 10^-5 of its length.
     """
-    weighted = np.swapaxes(np.sqrt(weights)[..., None] * by_states, 1, 2)
+    weighted = np.swapaxes(np.sqrt(weights)[..., None] * slopes.by_states, 1, 2)
     normal = weighted @ np.swapaxes(weighted, 1, 2)
-    slope = (weighted @ (np.sqrt(weights) * residuals)[..., None])[..., 0]
+    slope = (weighted @ (np.sqrt(weights) * slopes.residuals)[..., None])[..., 0]
     damped, lengths = _damped(normal, dampings)
     return -np.linalg.solve(damped, (slope / lengths)[..., None])[..., 0] / lengths
 
@@ -258,7 +255,6 @@ def eliminate(
     left = padded - basis @ within
     return Eliminated(
         reduced=Linearisation(left[..., 0], left[..., 1:]),
-        spare=1.0 - (basis[:, : slopes.residuals.shape[1]] ** 2).sum(-1),
         response=np.linalg.solve(factor, within),
         basis=basis,
         root=root,

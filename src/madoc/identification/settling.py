@@ -98,7 +98,7 @@ def settle(
     scaled = slopes.over(np.tile(deviation, readings.steps + 1))
     weights = loss_slope((scaled.residuals / TUNING[loss]) ** 2, loss) * scaled.whole[:, None]
     tried = np.maximum(np.array(TRIALS)[:, None] * damping, LEAST_DAMPING)
-    steps = states_steps(scaled.by_states, scaled.residuals, weights, tried)
+    steps = states_steps(scaled, weights, tried)
     moved = states + readings.in_state_units(steps, states.shape[1])
     after = readings.residuals(simulator, point[None], moved.reshape(1, -1, states.shape[1]))[0]
     whole = np.where(slopes.whole[:, None], slopes.residuals, np.nan)

@@ -121,7 +121,7 @@ class FittedReplays:
             part, around = first.of(gaining), states[gaining]
             (slopes,) = slopes_at(self.simulator, part, point[None], around[None], parameters=False)
             damping, alike = np.full((1, len(part)), LEAST_DAMPING), np.ones_like(slopes.residuals)
-            (moved,) = states_steps(slopes.by_states, slopes.residuals, alike, damping)
+            (moved,) = states_steps(slopes, alike, damping)
             step = first.in_state_units(moved * ~self.logged.in_plane, states.shape[1])
             tried = around + _SHARES[:, None, None] * step
             residuals = part.residuals(self.simulator, point[None], tried.reshape(1, -1, states.shape[1]))[0]
