@@ -279,12 +279,15 @@ def test_rows_alone_are_judged_by_the_classifier(word, before, after):
 
 @pytest.mark.parametrize("good", [PREDICTED, FITTED, TOLD_APART])
 def test_what_could_not_be_tested_or_stands_at_an_end_is_not_calibrated(good):
-    untested = judge(replace(good, tested=False))
     why = "the log tells no states" if good is TOLD_APART else "whether the model lacks anything was not tested"
-    assert untested.word == "NOT_IDENTIFIABLE" and f", but {why}" in untested.sentence
-    useful = replace(good, tested=False, open_loop=(predicted_over(1.0, 0.4, (0.3, 0.6)),))
-    assert good is TOLD_APART or judge(useful).word == "USABLE"
+    untested, useful = replace(good, tested=False), {"open_loop": (predicted_over(1.0, 0.4, (0.3, 0.6)),)}
+    assert judge(untested).word == "NOT_IDENTIFIABLE" and f", but {why}" in judge(untested).sentence
+    assert good is TOLD_APART or judge(replace(untested, **useful)).word == "USABLE"
     assert judge(replace(good, at_end=("mass",))).word == "MODEL_MISMATCH"
+    wide = replace(good, interval_shares={"mass": 0.9, "damping": 0.2}, **useful)
+    few = judge(replace(wide, open_in_time=("mass",)))
+    assert judge(wide).word == "NOT_IDENTIFIABLE" and "give it more time" in few.sentence
+    assert good is TOLD_APART or few.word == "USABLE"
 
 
 @EITHER
@@ -314,12 +317,8 @@ def test_a_right_guess_is_confirmed_where_intervals_hold_it(good):
 
 @EITHER
 def test_a_small_gain_counts_where_it_is_significant_and_the_rest_is_noise(good):
-    gain = {
-        "mid_range": errors(0.1, 0.41),
-        "relative": 0.97,
-        "nearby_relative": 0.97,
-        "relative_interval": (0.95, 0.99),
-    }
+    interval = {"relative_interval": (0.95, 0.99)}
+    gain = {"mid_range": errors(0.1, 0.41), "relative": 0.97, "nearby_relative": 0.97} | interval
     assert judge(changed(good, gain)).word == "CALIBRATED"
     assert judge(changed(good, gain | {"relative_interval": (0.94, 1.01)})).word == "NO_IMPROVEMENT"
     left = errors(0.3, 1.2)

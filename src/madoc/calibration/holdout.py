@@ -164,6 +164,8 @@ class Judged:
         imitated: Terms that the model has none of and parameters imitate, which the intervals do not cover.
         richer: The model with the likeliest term, where a parameter of a spec adds it and there was time to test it.
         tested: False where the log cannot tell whether the model lacks a term: it is too short, or tells no states.
+        open_in_time: Parameters that only the alternatives leave open, where there was no time to test these on as many
+            windows as usual.
         at_end: Parameters estimated at an end of their range that is no physical bound, but for those that are open.
         contradictions: Sentences of the check of the log that contradict the spec, such as actions that come late.
         coarseness: By how many typical changes predictions one stride ahead change where the model is integrated in
@@ -188,6 +190,7 @@ class Judged:
     imitated: tuple[ImitatedTerm, ...] = ()
     richer: RicherModel | None = None
     tested: bool = True
+    open_in_time: tuple[str, ...] = ()
     at_end: tuple[str, ...] = ()
     contradictions: tuple[str, ...] = ()
     coarseness: float = 0.0

@@ -27,7 +27,7 @@ MOST = 150
 """Largest number of windows."""
 FIT_STEPS = 10
 """Largest number of damped Gauss-Newton steps of an initial state, which begins at finite differences."""
-GAIN = 1e-3
+GAIN = 1e-2
 """Share in (0, 1] of a window's squared residuals; after a step that saves less its initial state is fitted."""
 FEW = 0.01
 """Share in [0, 1] of the windows, up to which no further step is taken for those that a step gained on."""

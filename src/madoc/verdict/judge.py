@@ -163,7 +163,8 @@ def _rejected(holdout: HoldOut) -> Verdict | None:
 
 
 def _open(holdout: HoldOut, combinations: Sequence[Combination]) -> Verdict | None:
-    shares = {name: share for name, share in holdout.interval_shares.items() if share >= OPEN}
+    in_time = holdout.open_in_time
+    shares = {name: each for name, each in holdout.interval_shares.items() if each >= OPEN and name not in in_time}
     if not shares:
         return None
     told = f"; it tells {', '.join(map(str, combinations))}" if combinations else ""
@@ -176,9 +177,14 @@ def _open(holdout: HoldOut, combinations: Sequence[Combination]) -> Verdict | No
 
 
 def _untested(holdout: HoldOut) -> Verdict | None:
-    if holdout.tested:
+    if holdout.tested and not holdout.open_in_time:
         return None
-    if isinstance(holdout, ToldApart):
+    if holdout.tested:
+        why = (
+            "the budget left time for fewer tests than usual of what the model lacks, and what they do not exclude "
+            f"leaves {', '.join(holdout.open_in_time)} open; give it more time"
+        )
+    elif isinstance(holdout, ToldApart):
         why = (
             "the log tells no states, which testing whether the model lacks anything takes; log positions and "
             "velocities, or rows in their order"

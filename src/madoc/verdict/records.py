@@ -20,7 +20,7 @@ from madoc.identification.excitation import expected_half_widths
 from madoc.identification.fitted_windows import SHORTER, WINDOWS
 from madoc.identification.information import OPEN
 from madoc.identification.missing_terms import OTHER_WINDOWS, Suspicions, suspicions
-from madoc.identification.term_tests import MissingTerm
+from madoc.identification.term_tests import Alternative, MissingTerm
 from madoc.identification.windows import horizons
 from madoc.parameters import ParameterSpace
 from madoc.verdict.adequacy import (
@@ -45,6 +45,8 @@ _MOST_TERMS = 5
 that are certain are kept, as a verdict rests on them."""
 EXCHANGED = "exchanged columns"
 """A part of judging without which nothing is tested."""
+FEWER = "tests on as many windows as usual"
+"""A part of judging; on fewer windows more terms seem possible, and intervals cover what they would change."""
 NO_DELAY = "look for a limit of speed or a filter of the drives or of the log before you add a delay to the spec"
 """What to do where actions take effect late, and delays and lags leave something over or were not tested."""
 _DELAYED = "action_delay"
@@ -77,7 +79,7 @@ def _doubts(
     if not bench.begins(part, 0.0 if enough else np.inf):
         return Suspicions(tested=False), False
     if shorter == 1 and most is not None and most < WINDOWS:
-        bench.left_out.append("tests on as many windows as usual")
+        bench.left_out.append(FEWER)
     doubts = suspicions(*given, problem.simulator, point, half_widths, bench.change, most=most, shorter=shorter)
     alternatives = in_full((*doubts.alternatives, *of_small_terms(doubts.terms)), doubts.terms)
     doubts = replace(doubts, alternatives=alternatives)
@@ -141,8 +143,10 @@ def judged(
     if bench.simulator.task.source is not None and bench.begins("the length of the timestep"):
         coarse, of_steps = coarseness(problem.dataset, bench.states, problem.simulator, point, bench.change)
     ends = point[:, None] + np.outer(own, (-1.0, 1.0)) if interval is None else space.to_unit(interval.T).T
-    shares = _shares(space, point[:, None] + np.outer(best, (-1.0, 1.0)), ends, own, doubts)
+    widths = space, point[:, None] + np.outer(best, (-1.0, 1.0)), ends, own
+    shares = _shares(*widths, doubts.alternatives)
     of_range = dict(zip(space.names, shares.tolist(), strict=True))
+    narrower = _shares(*widths, () if FEWER in bench.left_out else doubts.alternatives)
     signals = bench.simulator.task.signal_names[: len(noise)]
     found = record(
         split=bench.split,
@@ -157,6 +161,7 @@ def judged(
         alternatives=doubts.alternatives,
         imitated=doubts.imitated,
         tested=doubts.tested and EXCHANGED not in bench.left_out,
+        open_in_time=tuple(itertools.compress(space.names, (shares >= OPEN) & (narrower < OPEN))),
         coarseness=coarse,
         finer=finer,
         at_end=tuple(
@@ -298,12 +303,12 @@ def _shares(
     best: Float[np.ndarray, "d 2"],
     ends: Float[np.ndarray, "d 2"],
     half_widths: Float[np.ndarray, " d"],
-    doubts: Suspicions,
+    alternatives: Sequence[Alternative],
 ) -> Float[np.ndarray, " d"]:
     """Shares in [0, 1] of each range that intervals cover: the best possible, or the given ones widened, if wider.
 
     Another estimate of other windows says that the search is not at its end, not that a parameter is open.
     """
-    open_by = tuple(each for each in doubts.alternatives if each.causes != (OTHER_WINDOWS,))
+    open_by = tuple(each for each in alternatives if each.causes != (OTHER_WINDOWS,))
     ends = ends + half_widths[:, None] * widening(open_by, space.names) * (-1.0, 1.0)
     return np.maximum(*(np.ptp(np.clip(each, -1.0, 1.0), axis=1) / 2.0 for each in (best, ends)))
