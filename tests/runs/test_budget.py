@@ -31,3 +31,4 @@ def test_what_is_no_budget_is_refused(written):
 def test_a_search_gets_two_thirds_of_a_time_with_what_is_spent_before_it(spent, left):
     assert Seconds(120.0).for_search(spent).seconds == pytest.approx(left)
     assert Seconds(80.0).with_judging.seconds == pytest.approx(120.0)  # what a command takes whose search gets 80 s
+    assert Seconds(120.0).until_judged.seconds == pytest.approx(114.0)  # a film follows

@@ -43,7 +43,7 @@ def calibrate_in(
         if order.search.budget is None:  # the usual time is that of a search
             judged_by = began + budget.with_judging.seconds
         else:
-            judged_by, budget = began + budget.seconds, budget.for_search(time.monotonic() - began)
+            judged_by, budget = began + budget.until_judged.seconds, budget.for_search(time.monotonic() - began)
     spec = prepared.spec(out) | {"hyperparameters": hyperparameters(method)}
     with working_folder(out, spec, resume=resume) as folder:
         result = calibrate(

@@ -8,6 +8,8 @@ from madoc.types import Unit
 
 OF_SEARCH, LEAST_OF_SEARCH = 2.0 / 3.0, 0.2
 """Share of a time budget that a search may take, with what is spent before it, and the least one that it gets."""
+UNTIL_JUDGED = 0.95
+"""Share of a time budget at which judging is to end, as a film of the motion follows."""
 
 
 @dataclass(frozen=True)
@@ -22,6 +24,11 @@ class Seconds:
     def for_search(self, spent: float) -> "Seconds":
         """What a search gets of a time that is for a whole command, judging included, of which some is spent."""
         return Seconds(self.seconds * max(LEAST_OF_SEARCH, OF_SEARCH - spent / self.seconds))
+
+    @property
+    def until_judged(self) -> "Seconds":
+        """The time from the start of a whole command of this budget to the end of judging."""
+        return Seconds(self.seconds * UNTIL_JUDGED)
 
     @property
     def with_judging(self) -> "Seconds":
