@@ -1,5 +1,8 @@
 """Robots small enough to work out by hand or to calibrate in seconds, and logs of them."""
 
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import mujoco
 
@@ -7,6 +10,7 @@ from madoc import simulation
 from madoc.data.record import record
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.parameters import Parameter, ParameterSpace
+from madoc.simulation.base import SIMULATED
 from madoc.tasks.base import Task
 
 SPRING = """
@@ -196,3 +200,9 @@ CELL = """\
     set: {windows: 4}
 """
 """A cell of a suite's file: a calibration of some hundredths of a second."""
+
+
+def counted(work: Callable[..., Any], *given: Any, **named: Any) -> tuple[Any, int]:
+    """What a function returns, and the control steps that it simulates."""
+    began = SIMULATED.control_steps
+    return work(*given, **named), SIMULATED.control_steps - began

@@ -32,7 +32,7 @@ from madoc.identification.settling import RESETTLING, settled, settled_to_noise
 from madoc.identification.windows import disjoint_windows
 from madoc.runs.checkpoint import load, save
 from own_robots import write_robot
-from robots import SPRING_TRUTH, recorded, spring
+from robots import SPRING_TRUTH, counted, recorded, spring
 
 FOOT = """
 <mujoco>
@@ -155,7 +155,7 @@ def test_likely_states_before_a_window_explain_it_where_narrow_steps_do_not(tmp_
     readings = Readings.at(problem.dataset, logged, rows, steps, problem.typical_change)
     given = problem.dataset, logged, simulator, readings, rows, point
     guesses = logged.states[rows]
-    states, spent = with_contacts_settled(*given, guesses)
+    states, spent = counted(with_contacts_settled, *given, guesses)
     narrow = settled(simulator, readings, point, guesses, (0.0, *RESETTLING), 0)
     found = settled(simulator, readings, point, states, (0.0,), 0)
     size = readings.observed[0].size
@@ -163,12 +163,13 @@ def test_likely_states_before_a_window_explain_it_where_narrow_steps_do_not(tmp_
     assert (found.deviation[2:] < 0.95 * narrow.deviation[2:]).all()  # of speeds, which contacts decide
     begun = int((rows - problem.dataset.episode_starts[problem.dataset.episode_of(rows)] >= BEFORE).sum())
     drawn = NOISE_ROUNDS * begun * DRAWN * BEFORE + len(rows) * (DRAWN + 1) * steps
-    (likely,), of_draws = likely_states(*given[:-1], point[None], guesses)
-    of_two, _ = likely_states(*given[:-1], np.stack([np.zeros_like(point), point]), guesses)
+    (likely,), of_draws = counted(likely_states, *given[:-1], point[None], guesses)
+    of_two = likely_states(*given[:-1], np.stack([np.zeros_like(point), point]), guesses)
     assert (of_two[1] == likely).all() and (of_two[0] != likely).any()  # of the same states, each its own choice
-    after = settled_to_noise(simulator, readings, point, likely)
-    assert of_draws == drawn and spent == drawn + after.simulations * steps
-    untouched, nothing = with_contacts_settled(*given, aloft := np.add(guesses, [0.0, 1.0, 0.0, 0.0]))
+    _, settling = counted(settled_to_noise, simulator, readings, point, likely)
+    assert of_draws == drawn and spent == drawn + settling
+    aloft = np.add(guesses, [0.0, 1.0, 0.0, 0.0])
+    untouched, nothing = counted(with_contacts_settled, *given, aloft)
     assert nothing == 0 and (untouched == aloft).all()  # without contacts derivatives at the guesses serve
 
 
@@ -366,7 +367,7 @@ def test_an_epoch_at_rest_tells_what_half_the_ensemble_errs_and_moves_nothing(tm
     told = np.broadcast_to(np.eye(2), (len(search.rows), 2, 2))
     rest = replace(search, point=np.array([0.0, 0.0]), wide=3, quiet=1, together=filtering.TOGETHER, squares=told)
     assert rest.at_rest and not rest.settled and rest.members == filtering.MEMBERS // 2
-    after, epoch = filtering.step(problem, rest, "cauchy")
+    (after, _), spent = counted(filtering.step, problem, rest, "cauchy")
     assert after.settled
     np.testing.assert_array_equal(after.point, rest.point)
     assert not rest.apart.any() and after.apart.all() and after.chance.all()
@@ -375,7 +376,7 @@ def test_an_epoch_at_rest_tells_what_half_the_ensemble_errs_and_moves_nothing(tm
     np.testing.assert_allclose(covariance, np.array([[1.0, 2.0], [2.0, 4.0]]) / (1e3 * len(told)) ** 2)
     systems = filtering.MEMBERS + 2 * 2 * len(problem.simulator.parameters) * instruments.FEW
     large = filtering.LARGE_ROUNDS * filtering.LARGE * search.size
-    assert epoch.control_steps == (systems * len(search.rows) + large) * filtering.horizon_of(problem)
+    assert spent == (systems * len(search.rows) + large) * filtering.horizon_of(problem)
 
 
 def test_epochs_near_the_end_take_other_windows_and_count_together(tmp_path):

@@ -18,13 +18,13 @@ from madoc.identification.gauss_newton import FIRST_DAMPING, TRIALS
 from madoc.identification.losses import ALL_FAILED
 from madoc.identification.replay import window_residuals
 from madoc.identification.windows import windows_at
-from robots import SPRING_TRUTH, recorded, spring
+from robots import SPRING_TRUTH, counted, recorded, spring
 
 SPRING = spring(max_episode_steps=100)
 
 
 def outcome(*totals, before=4.0):
-    return Outcome(before, np.array(totals), np.zeros((len(totals), 0)), 0, 0)
+    return Outcome(before, np.array(totals), np.zeros((len(totals), 0)), 0)
 
 
 def test_the_step_that_helps_most_is_taken_and_its_damping_kept():
@@ -78,8 +78,8 @@ def test_one_search_finds_a_clean_spring_from_known_and_unknown_states(starts):
     state, spent = search.init(problem, jax.random.key(1)), 0
     assert state.states.shape[1:] == ((0, 0) if starts is KnownStarts else (40, 2))
     for _ in range(25):
-        state, epoch = search.step(problem, state)
-        spent += epoch.control_steps
+        (state, _), steps = counted(search.step, problem, state)
+        spent += steps
         if search.settled(state):
             break
     assert search.settled(state)
@@ -124,20 +124,20 @@ def test_states_of_smooth_motion_settle_at_once_and_parameters_move_by_plain_ste
     first = search.init(problem, jax.random.key(1))
     state = replace(first, point=truth[None], refining=1, waiting=1)
     point = state.point.copy()
-    state, epoch = search.step(problem, state)
+    (state, _), spent = counted(search.step, problem, state)
     assert state.waiting == 0
-    assert epoch.control_steps == 40 * 5 * (1 + 2 + 3)
+    assert spent == 40 * 5 * (1 + 2 + 3)
     np.testing.assert_array_equal(state.point, point)
-    state, epoch = search.step(problem, state)
+    (state, _), spent = counted(search.step, problem, state)
     derivatives, tried = 1 + len(truth) + 2, 1  # the first step helps, so no other is tried
-    assert epoch.control_steps == 40 * 5 * (derivatives + tried)
+    assert spent == 40 * 5 * (derivatives + tried)
     assert (state.point != point).all()
     assert state.damping[0] == FIRST_DAMPING * TRIALS[0]
     windows = UnknownStarts.at(problem, state.rows, state.touching, 5, "cauchy")
     (plan,) = windows.plans(state.point, state.states, state.damping, state.state_damping, refining=True)
     astray = replace(plan, steps=np.concatenate([[1.0 - plan.point], plan.steps[1:]]))
-    (outcome,) = windows.outcomes([astray], state.states, refining=True)
-    assert outcome.simulations == 40 * (tried + 4 * 3)  # it does not help: every step with every share of the states'
+    (outcome,), spent = counted(windows.outcomes, [astray], state.states, refining=True)
+    assert spent == 40 * 5 * (tried + 4 * 3)  # it does not help: every step with every share of the states'
     assert outcome.chosen()[0] != 0
     # After many steps one of half a standard error settles, five times as long as before, and counts as an error.
     while not search.settled(state):

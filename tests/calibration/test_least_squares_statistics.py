@@ -19,7 +19,7 @@ from madoc.calibration.least_squares.unknown_starts import FAILED_WINDOW, LIKE_N
 from madoc.data import Disturbance, disturb
 from madoc.identification.noise import alternation
 from own_robots import BOUNCER, BOUNCER_SPEC, write_robot
-from robots import SPRING_TRUTH, recorded, spring
+from robots import SPRING_TRUTH, counted, recorded, spring
 
 LEG_TRUTH = {"body_mass.trunk": 2.0, "body_mass.leg": 0.5, "dof_damping.knee": 5.0}
 LIMITS = {"least": LIKE_NOISE, "failed": FAILED_WINDOW}
@@ -40,7 +40,7 @@ def test_rows_without_an_order_have_no_pairs():
         recorded(task, SPRING_TRUTH, 50, jax.random.key(0)), Disturbance(shuffled="rows"), task, jax.random.key(1)
     )
     problem = CalibrationProblem(log, simulation.make(task, threads=1))
-    (before, after), spent = consecutive_residuals(problem, np.zeros(len(SPRING_TRUTH)), np.arange(50))
+    (before, after), spent = counted(consecutive_residuals, problem, np.zeros(len(SPRING_TRUTH)), np.arange(50))
     assert (before.shape, after.shape, spent) == ((0, 2), (0, 2), 0)
     assert alternation(before, after) == 0.0
 

@@ -16,7 +16,7 @@ from madoc.identification.information import Uncertainty
 from madoc.identification.linearisation import Linearisation
 from madoc.runs.checkpoint import difference, layout
 from own_robots import PENDULUM_SPEC, write_robot
-from robots import recorded
+from robots import counted, recorded
 
 SPEC = PENDULUM_SPEC.replace("actions:", "  - {name: speed, reads: velocity(pivot)}\nactions:")
 DRAG = "parameters:\n  - {field: dof_drag, element: pivot, low: 0, high: 1}"
@@ -84,7 +84,7 @@ def test_windows_last_a_second_and_there_are_none_in_a_log_that_is_too_short(pen
 def test_initial_states_are_fitted_to_the_readings_after_them_and_then_held(pendulum):
     problem, true = problem_of(pendulum, log_of(pendulum, TRUTH, 0)), log_of(pendulum, TRUTH, 0)
     state, point = predicting.windows_for(problem), pendulum.parameters.to_unit(pendulum.parameters.vector(TRUTH))
-    begun, spent = predicting.begun(problem, state, point, 20)
+    begun, spent = counted(predicting.begun, problem, state, point, 20)
     assert spent > 0
     assert difference(layout(begun), layout(state)) is None
     angles = np.asarray(true.transitions.observation)[state.rows, 0]
@@ -105,7 +105,7 @@ def test_a_start_that_a_false_reading_spoils_is_left_out_and_no_reading_is_of_th
     seen[spoilt : spoilt + 4] += 50.0 * problem.typical_change
     transitions = replace(problem.dataset.transitions, observation=seen, next_observation=np.roll(seen, -1, axis=0))
     false = CalibrationProblem(replace(problem.dataset, transitions=transitions), problem.simulator)
-    begun, _ = predicting.begun(false, state, point, 10_000)  # longer than a second, to the end of which windows fit
+    begun = predicting.begun(false, state, point, 10_000)  # longer than a second, to the end of which windows fit
     assert not begun.kept[7]
     assert begun.kept.mean() > 0.9
     assert predicting._residuals(false, begun, point[None]).shape[1] == begun.kept.sum()
@@ -113,7 +113,7 @@ def test_a_start_that_a_false_reading_spoils_is_left_out_and_no_reading_is_of_th
 
 def test_a_window_that_fails_ends_the_fit_with_the_estimate_so_far(pendulum):
     problem = problem_of(pendulum, log_of(pendulum, TRUTH, 0))
-    begun, _ = predicting.begun(problem, predicting.windows_for(problem), np.zeros(3), 0)
+    begun = predicting.begun(problem, predicting.windows_for(problem), np.zeros(3), 0)
     broken = replace(begun, states=np.where(np.arange(60)[:, None] == 3, np.nan, begun.states))
     after, _ = predicting.step(problem, broken)
     assert after.progress == "no better"
@@ -126,7 +126,7 @@ def test_errors_of_noise_alone_end_the_fit(pendulum):
     problem = problem_of(pendulum, log_of(pendulum, TRUTH, 0))
     point = pendulum.parameters.to_unit(pendulum.parameters.vector(TRUTH))
     for off, progress in ((1e-3, "no better"), (0.2, "under way")):
-        begun, _ = predicting.begun(problem, predicting.windows_for(problem), point + off, 20)
+        begun = predicting.begun(problem, predicting.windows_for(problem), point + off, 20)
         assert begun.noise > 0.0
         assert predicting.step(problem, begun)[0].progress == progress
 

@@ -16,7 +16,7 @@ from madoc.diagnosis.excitation import excite
 from madoc.errors import MadocError
 from madoc.identification.states import states_of
 from madoc.simulation.sensitivity import refuse_insensitive
-from robots import ARM
+from robots import ARM, counted
 
 ROWS = 300
 
@@ -59,9 +59,14 @@ def test_a_good_log_has_nothing_to_warn_of(robot, columns, checked):
 def test_without_intervals_a_check_finds_the_same_in_fewer_steps(robot, columns, checked, tmp_path):
     whole, _ = checked(robot, columns)
     dataset = logs.read(write_csv(tmp_path / "again.csv", columns), robot)
-    short = check(dataset, simulation.make(robot.task, threads=1), robot=robot, intervals=False)
+    simulator = simulation.make(robot.task, threads=1)
+    short = check(dataset, simulator, robot=robot, intervals=False)
     assert short.findings == whole.findings
-    assert short.excitation.control_steps < 0.8 * whole.excitation.control_steps
+    given, start = (dataset, simulator, states_of(dataset, simulator)), whole.explanation.draws[whole.explanation.best]
+    of_short, of_whole = (
+        counted(excite, *given, start=start, key=jax.random.key(0), intervals=wanted)[1] for wanted in (False, True)
+    )
+    assert of_short < 0.8 * of_whole
     assert short.control_steps < whole.control_steps
 
 
@@ -289,4 +294,5 @@ parameters:
     columns = {"time": 0.02 * np.arange(300), "along": along, "up": up, "push": 20.0 * push}
     dataset = logs.read(write_csv(tmp_path / "log.csv", columns), robot)
     assert not check(dataset, simulator, robot=robot).fatal
-    assert refuse_insensitive(simulator, *CalibrationProblem(dataset, simulator).probe, key=jax.random.key(0)) > 0
+    probe = CalibrationProblem(dataset, simulator).probe
+    assert counted(refuse_insensitive, simulator, *probe, key=jax.random.key(0))[1] > 0

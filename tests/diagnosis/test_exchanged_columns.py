@@ -12,6 +12,7 @@ from madoc.diagnosis.exchanged_columns import exchanged_columns
 from madoc.identification.replay import window_residuals
 from madoc.identification.states import logged_states
 from madoc.identification.windows import evenly, first_rows, windows_at
+from robots import counted
 
 DELAY = "  - {field: action_delay, low: 0, high: 0.06}\n"
 
@@ -35,7 +36,7 @@ def told(robot, tmp_path):
         simulator = simulation.make(robot.task, threads=1)
         points = simulator.parameters.to_unit(TRUTH)[None]
         scale = unit * typical_change(dataset)
-        findings, spent = exchanged_columns(dataset, simulator, points, 10, scale, contradicts=True)
+        findings, spent = counted(exchanged_columns, dataset, simulator, points, 10, scale, contradicts=True)
         assert spent > 0
         return [finding.what.partition(";")[0] for finding in findings]
 
@@ -92,7 +93,7 @@ def test_a_log_is_predicted_in_its_windows_as_it_is_as_a_whole(tmp_path):
         at_end = window_residuals(simulator, windows, points, scale)[..., -4:]
         return np.median(np.sqrt((at_end**2).mean(-1)), axis=1).min()
 
-    (finding,), spent = exchanged_columns(wrong, simulator, points, 10, scale, contradicts=True)
+    (finding,), spent = counted(exchanged_columns, wrong, simulator, points, 10, scale, contradicts=True)
     times = f"{error(wrong) / error(right):.2g}"
     assert finding.what == f"the joint elbow has the other sign; put right, the log is predicted {times} times better"
     assert spent == 5 * 64 * 10  # as logged, and with one action or a joint reversed or both joints exchanged

@@ -25,7 +25,7 @@ def told(tmp_path):
         dataset = logs.read(write_csv(tmp_path / "log.csv", columns), robot)
         simulator = simulation.make(robot.task, threads=1)
         points = box_draws(len(simulator.parameters), jax.random.key(0))
-        found, _ = response_findings(dataset, simulator, states_of(dataset, simulator), points)
+        found = response_findings(dataset, simulator, states_of(dataset, simulator), points)
         return [(finding.where, finding.what) for finding in found], measured_responses(dataset, simulator)
 
     return run

@@ -13,6 +13,7 @@ from madoc.diagnosis import check, scales
 from madoc.diagnosis.scales import COARSE, coarseness, range_findings
 from madoc.identification.states import states_of
 from own_robots import BOUNCER, BOUNCER_SPEC, CART, CART_SPEC, task_of
+from robots import counted
 from robots import recorded as planted
 
 SCALED = (
@@ -128,7 +129,7 @@ def test_a_timestep_that_diverges_counts_as_too_long(box, monkeypatch):
     simulator = simulation.make(robot.task, threads=1)
     both = iter([np.full((1, 64, 4), np.nan), np.zeros((1, 64, 4))])
     monkeypatch.setattr(scales, "window_residuals", lambda *_: next(both))
-    assert coarseness(dataset, states_of(dataset, simulator), simulator, np.zeros(1), np.ones(4)) == (1.0, 2 * 64)
+    assert coarseness(dataset, states_of(dataset, simulator), simulator, np.zeros(1), np.ones(4)) == 1.0
 
 
 def test_smooth_motion_hardly_depends_on_the_timestep(tmp_path):
@@ -142,7 +143,7 @@ def test_smooth_motion_hardly_depends_on_the_timestep(tmp_path):
     dataset = logs.read(write_csv(tmp_path / "log.csv", columns), robot)
     simulator = simulation.make(robot.task, threads=1)
     middle = np.zeros(len(simulator.parameters))
-    change, spent = coarseness(dataset, states_of(dataset, simulator), simulator, middle, np.ones(2))
+    change, spent = counted(coarseness, dataset, states_of(dataset, simulator), simulator, middle, np.ones(2))
     assert 0.0 < change < COARSE / 10
     assert spent == 2 * 64 * stride(dataset)
 

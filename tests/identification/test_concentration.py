@@ -26,7 +26,7 @@ def found(errors, names=None):
     readings = Readings(np.zeros((100, STEPS, 1)), np.zeros(errors.shape), changes, np.ones(2))
     windows = LoggedWindows(readings, none, none, none[:, None], dataset.episode_of(rows), rows)
     slopes = WindowSlopes(errors.reshape(100, values), *(np.zeros((100, values, 0)),) * 2, np.ones(100, bool))
-    fit = Fit(np.zeros(0), none, slopes, np.zeros((100, values, 0)), slopes.whole, 0)
+    fit = Fit(np.zeros(0), none, slopes, np.zeros((100, values, 0)), slopes.whole)
     return concentration(dataset, windows, fit, SIGNALS, 0.01)
 
 
@@ -75,7 +75,7 @@ def test_what_is_left_is_alike_in_a_row_where_it_is_not_noise():
 
     def of(errors):
         slopes = WindowSlopes(errors.reshape(100, 15), *(np.zeros((100, 15, 0)),) * 2, np.ones(100, bool))
-        fit = Fit(np.zeros(0), np.zeros((100, 0)), slopes, np.zeros((100, 15, 0)), slopes.whole, 0)
+        fit = Fit(np.zeros(0), np.zeros((100, 0)), slopes, np.zeros((100, 15, 0)), slopes.whole)
         return alike_in_a_row(fit, readings)
 
     assert of(alike()) == pytest.approx(0.8)

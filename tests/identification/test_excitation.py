@@ -9,7 +9,7 @@ from madoc.identification.excitation import expected_half_widths, widened
 from madoc.identification.states import states_of
 from madoc.parameters import Parameter
 from own_robots import CART_SPEC, write_robot
-from robots import SPRING_TRUTH, recorded, spring
+from robots import SPRING_TRUTH, counted, recorded, spring
 
 
 def test_the_half_width_of_a_stiffness_is_that_of_a_regression():
@@ -19,7 +19,8 @@ def test_the_half_width_of_a_stiffness_is_that_of_a_regression():
     log = recorded(spring(max_episode_steps=100), SPRING_TRUTH, 300, jax.random.key(0))
     simulator = simulation.make(task, threads=1)
     noise = np.array([1e9, 0.01])
-    half, spent = expected_half_widths(states_of(log, simulator), log, simulator, np.zeros(1), noise, exact=True)
+    given = states_of(log, simulator), log, simulator, np.zeros(1), noise
+    half, spent = counted(expected_half_widths, *given, exact=True)
     slope = 0.02 / 2.0 * log.transitions.observation[:, 0] * 10.0
     assert half == pytest.approx([1.959964 * 0.01 / np.sqrt((slope**2).sum())], rel=0.05)
     assert spent == 3 * 300
@@ -31,7 +32,7 @@ def test_without_speeds_it_is_noise_over_windows_that_widens_them(tmp_path):
     log, simulator = recorded(task, {"body_mass.cart": 1.0}, 400, jax.random.key(0)), simulation.make(task, threads=1)
     logged = states_of(log, simulator)
     first, second = (
-        expected_half_widths(logged, log, simulator, np.zeros(1), np.array([noise]), exact=False)[0]
+        expected_half_widths(logged, log, simulator, np.zeros(1), np.array([noise]), exact=False)
         for noise in (1e-5, 2e-5)
     )
     assert 0.0 < first < 0.1

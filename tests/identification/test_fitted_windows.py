@@ -13,7 +13,7 @@ from madoc.identification.fitted_windows import fit_windows, windows_of
 from madoc.identification.linearisation import WindowSlopes
 from madoc.identification.replay import Readings
 from madoc.identification.states import states_of
-from robots import SPRING_TRUTH, recorded, spring
+from robots import SPRING_TRUTH, counted, recorded, spring
 
 
 @pytest.fixture(scope="module")
@@ -39,17 +39,17 @@ def test_it_counts_what_it_simulates(windows, monkeypatch):
     simulator, readings, states = windows
     simulated, once = [], Readings.residuals
 
-    def counted(self, simulator, points, states):
+    def residuals(self, simulator, points, states):
         simulated.append(len(points) * states.shape[1] * self.steps)
         return once(self, simulator, points, states)
 
-    monkeypatch.setattr(Readings, "residuals", counted)
-    assert fit_windows(simulator, readings, states, np.zeros(3)).control_steps == sum(simulated)
+    monkeypatch.setattr(Readings, "residuals", residuals)
+    assert counted(fit_windows, simulator, readings, states, np.zeros(3))[1] == sum(simulated)
 
 
 def test_a_step_on_which_windows_fail_is_not_taken(windows, monkeypatch):
     simulator, readings, states = windows
-    start = fitted_windows._sloped(simulator, readings, states, np.zeros(3), 0)
+    start = fitted_windows._sloped(simulator, readings, states, np.zeros(3))
     failing = np.full((len(fitted_windows.LENGTHS), 1, *start.slopes.residuals.shape), np.nan)
     failing[:, :, : len(states) // 3] = 0.0  # a third of the windows would be explained without a residual
     monkeypatch.setattr(Readings, "residuals", lambda *_: failing)
@@ -60,11 +60,11 @@ def test_a_step_on_which_windows_fail_is_not_taken(windows, monkeypatch):
 
 def test_where_every_window_fails_the_start_is_kept(windows):
     simulator, readings, states = windows
-    fit = fit_windows(simulator, readings, np.full_like(states, np.nan), np.zeros(3))
+    fit, spent = counted(fit_windows, simulator, readings, np.full_like(states, np.nan), np.zeros(3))
     assert fit.point.tolist() == [0.0, 0.0, 0.0]
     assert not fit.slopes.whole.any()
     by_states, by_parameters = 1 + 2, 1 + 2 * 3
-    assert fit.control_steps == (by_states + by_parameters) * len(readings) * readings.steps
+    assert spent == (by_states + by_parameters) * len(readings) * readings.steps
 
 
 def test_slopes_at_another_point_leave_out_windows_that_fail_there():

@@ -9,7 +9,7 @@ from test_noise import body_task
 from madoc import simulation
 from madoc.identification.replay import Readings
 from madoc.identification.responses import responses_of
-from robots import spring
+from robots import counted, spring
 
 WHOLE = np.ones(2, bool)
 
@@ -27,7 +27,7 @@ def test_a_force_on_a_free_body_adds_up_by_hand(tmp_path):
     state = np.concatenate([[0.0, 0.0, 1.0, np.cos(0.4), 0.0, 0.0, np.sin(0.4)], np.zeros(6)])
     simulator, readings = of_windows(task, np.zeros((2, 3, 1)))
     states = np.stack([state, state])
-    responses = responses_of(simulator, readings, -np.ones(1), states, WHOLE)
+    responses, steps_taken = counted(responses_of, simulator, readings, -np.ones(1), states, WHOLE)
     forces = np.zeros((2, 3, 6, 1))
     forces[:, :, 0] = 1.0
     found = responses.effects(forces).reshape(2, 4, 13)[0]
@@ -35,7 +35,7 @@ def test_a_force_on_a_free_body_adds_up_by_hand(tmp_path):
     assert found[:, 0] == pytest.approx(0.02**2 * steps * (steps + 1) / 2 / 0.5, abs=1e-9)
     assert found[:, 7] == pytest.approx(0.02 * steps / 0.5, abs=1e-9)
     assert np.delete(found, [0, 7], axis=1) == pytest.approx(0.0, abs=1e-9)
-    assert responses.control_steps == (2 + 18) * 2 * 3
+    assert steps_taken == (2 + 18) * 2 * 3
 
 
 def test_effects_are_those_of_small_forces_that_are_simulated(tmp_path):

@@ -22,7 +22,7 @@ from madoc.identification.settling import (
     settled_to_noise,
     window_costs,
 )
-from robots import SPRING_TRUTH, recorded, spring
+from robots import SPRING_TRUTH, counted, recorded, spring
 
 
 def windows(task, truth, steps, noise):
@@ -62,7 +62,7 @@ def test_the_cost_of_normal_noise():
 def test_a_window_is_unexplained_beyond_three_deviations_of_its_cost():
     limit = 1.0 + 3.0 * np.sqrt(2.0) / 10.0
     costs = np.array([1.0, limit - 1e-6, limit + 1e-6])
-    some = Settled(np.zeros((3, 1)), np.ones(3), np.ones(1), np.ones(1), costs, 0, 0)
+    some = Settled(np.zeros((3, 1)), np.ones(3), np.ones(1), np.ones(1), costs, 0)
     assert some.unexplained(100, "linear").tolist() == [False, False, True]
 
 
@@ -70,11 +70,12 @@ def test_states_of_a_smooth_robot_settle_in_two_steps_at_any_width():
     task = spring(max_episode_steps=100)
     simulator, readings, guesses = windows(task, SPRING_TRUTH, 9, 0.1)
     point = task.parameters.to_unit(task.parameters.vector(SPRING_TRUTH))
-    narrow, wide = (descended(simulator, readings, guesses, point, widths) for widths in ((0, 0), (0, 3)))
+    narrow, spent = counted(descended, simulator, readings, guesses, point, (0, 0))
+    wide = descended(simulator, readings, guesses, point, (0, 3))
     np.testing.assert_allclose(narrow.states, wide.states, atol=2e-4)
     np.testing.assert_allclose(narrow.deviation, 0.1, rtol=0.3)
     assert not narrow.unexplained(readings.observed[0].size, "cauchy").any()
-    assert narrow.simulations == len(readings) * 6
+    assert spent == 2 * len(readings) * 6 * readings.steps
 
 
 def test_wide_differences_and_restarts_find_states_at_contacts():
@@ -90,7 +91,7 @@ def test_wide_differences_and_restarts_find_states_at_contacts():
     assert missed[2] < missed[1]
     assert (again.costs <= wide.costs).all()
     given = problem.dataset, problem.states, simulator, readings, rows, point, guesses
-    states, spent = with_contacts_settled(*given)
+    states, spent = counted(with_contacts_settled, *given)
     residuals = readings.residuals(simulator, point[None], states[None])[0, 0] / np.tile(wide.deviation, 6)
     drawn = replace(wide, costs=window_costs(residuals, "cauchy"))
     assert drawn.unexplained(values, "cauchy").sum() <= missed[1]
@@ -104,7 +105,7 @@ def test_new_beginnings_end_once_one_explains_hardly_any_more_windows(monkeypatc
 
     def left(share):
         many = np.where(np.arange(len(readings)) < share * len(readings), high, 0.0)
-        return Settled(guesses, np.ones(len(readings)), np.ones(2), np.ones(2), many, 0, 0)
+        return Settled(guesses, np.ones(len(readings)), np.ones(2), np.ones(2), many, 0)
 
     monkeypatch.setattr(settling, "settled", lambda *_: left(next(costs)))
     monkeypatch.setattr(settling, "restart", lambda *_: left(next(costs)))

@@ -12,6 +12,7 @@ from madoc.identification.linearisation import WindowSlopes
 from madoc.verdict import fitted
 from madoc.verdict.bench import FEWEST_FITTED
 from madoc.verdict.fitted_starts import fitted_replays_of, replay_steps
+from robots import counted
 
 ARM, TRUTH = replace(ROBOTS["arm"][0], velocities=2), ROBOTS["arm"][1]
 AT_TRUTH = ARM.parameters.to_unit(ARM.parameters.vector(TRUTH))[None]
@@ -24,18 +25,18 @@ def replays_under(noise):
 
 
 def test_hidden_velocities_are_found_at_the_truth():
-    residuals, _ = replays_under(0.0).residuals(AT_TRUTH)
+    residuals = replays_under(0.0).residuals(AT_TRUTH)
     assert np.abs(residuals).max() < 1e-8
 
 
 def test_fits_end_where_steps_gain_little():
     replays = replays_under(0.2)
-    _, spent = replays.starts(AT_TRUTH)
+    _, spent = counted(replays.starts, AT_TRUTH)
     of_a_step = (1 + 4 + 3) * replays.fitted * len(replays.readings)  # residuals, differences, shares of the step
     assert spent % (of_a_step // len(replays.readings)) == 0
     assert of_a_step < spent < 2.5 * of_a_step  # the second step moves the windows that the first one gained on
-    assert replace(replays, most_steps=1).starts(AT_TRUTH)[1] == of_a_step
-    residuals, whole = replays.residuals(AT_TRUTH)
+    assert counted(replace(replays, most_steps=1).starts, AT_TRUTH)[1] == of_a_step
+    residuals, whole = counted(replays.residuals, AT_TRUTH)
     assert whole == spent + len(replays.readings) * replays.readings.steps
     first, ahead = residuals[0, :, : replays.fitted + 1], residuals[0, :, replays.fitted + 1 :]
     assert (
@@ -45,13 +46,13 @@ def test_fits_end_where_steps_gain_little():
 
 def test_starts_near_those_of_another_system_are_as_good_and_no_better():
     replays, point = replays_under(0.2), AT_TRUTH + 0.01
-    states, _ = replays.starts(AT_TRUTH)
-    (alone, spent), (near, fewer) = replays.starts(point), replays.starts(point, states[0])
+    states = replays.starts(AT_TRUTH)
+    (alone, spent), (near, fewer) = counted(replays.starts, point), counted(replays.starts, point, states[0])
     left = [np.square(replays.residuals_from(point, each)[0, :, : replays.fitted + 1]).sum() for each in (alone, near)]
     np.testing.assert_allclose(left[1], left[0], rtol=1e-3)
     assert fewer < spent
     hurried = replace(replays, most_steps=1)  # more steps would be an advantage over the other system
-    np.testing.assert_array_equal(hurried.starts(point, states[0])[0], hurried.starts(point)[0])
+    np.testing.assert_array_equal(hurried.starts(point, states[0]), hurried.starts(point))
 
 
 def test_the_best_nearby_is_the_estimate_where_every_simulation_fails(monkeypatch):
@@ -60,7 +61,7 @@ def test_the_best_nearby_is_the_estimate_where_every_simulation_fails(monkeypatc
     parts = np.zeros((windows, 1)), np.zeros((windows, 1, 1)), np.zeros((windows, 1, 1))
     failed = WindowSlopes(*parts, whole=np.zeros(windows, dtype=bool))
     monkeypatch.setattr(fitted, "slopes_at", lambda *_: [failed])
-    points, _ = fitted._nearby_best(replays, AT_TRUTH[0], replays.near)
+    points = fitted._nearby_best(replays, AT_TRUTH[0], replays.near)
     np.testing.assert_array_equal(points, AT_TRUTH)
 
 

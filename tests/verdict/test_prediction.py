@@ -14,7 +14,7 @@ from madoc.verdict.bench import Bench
 from madoc.verdict.predicted import noisy_contacts
 from madoc.verdict.prediction import nearby_best, replays_of
 from own_robots import BOUNCER, BOUNCER_SPEC, write_robot
-from robots import recorded
+from robots import counted, recorded
 
 TASK, TRUTH = ROBOTS["spring"]
 SIMULATOR = simulation.make(TASK, threads=1)
@@ -51,7 +51,7 @@ def test_horizons_that_no_episode_lasts_are_left_out():
 def test_nearby_the_truth_is_found():
     replays = replays_of(log_of("spring", rows=300), SIMULATOR, SCALE, HORIZONS)
     truth = TASK.parameters.to_unit(TASK.parameters.vector(TRUTH))
-    points, spent = nearby_best(replays, np.clip(truth + 0.2, -1, 1))
+    points, spent = counted(nearby_best, replays, np.clip(truth + 0.2, -1, 1))
     assert points[-1] == pytest.approx(truth, abs=1e-4)
     assert spent % (7 * len(replays.windows)) == 0
     assert 2 <= spent / (7 * len(replays.windows)) <= 8

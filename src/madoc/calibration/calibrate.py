@@ -17,6 +17,7 @@ from madoc.runs.budget import Budget
 from madoc.runs.files import replacing
 from madoc.runs.machine import one_blas_thread
 from madoc.runs.run_folder import RunFolder
+from madoc.simulation.base import SIMULATED
 from madoc.simulation.sensitivity import refuse_insensitive
 from madoc.simulation.write import nominal_values
 from madoc.tasks import Task
@@ -52,7 +53,10 @@ def calibrate(
     true_values = None if truth is None else space.vector(truth)
     entry = entry_of(method, CALIBRATORS)
     method.init(problem, key)  # a refusal of the method comes before one of the parameters
-    probing = refuse_insensitive(problem.simulator, *problem.probe, key=jax.random.key(0)) if entry.simulates else 0
+    began = SIMULATED.control_steps
+    if entry.simulates:
+        refuse_insensitive(problem.simulator, *problem.probe, key=jax.random.key(0))
+    probing = SIMULATED.control_steps - began
     finished = loop.run(
         method,
         problem,

@@ -158,7 +158,7 @@ class Judged:
         interval_shares: Share of each parameter's range that its 95 % confidence interval covers, at most 1.
         against_chance: Permutation tests, one for each of several predictors.
         noise: Standard deviation of the sensor noise of those signals where it can be estimated, in the signal's unit.
-        control_steps: Control steps that were simulated for this record.
+        control_steps: Control steps that were simulated in judging.
         missing_terms: Terms that the model may lack, the most significant first.
         alternatives: Other estimates that the log does not exclude, which the intervals cover.
         imitated: Terms that the model has none of and parameters imitate, which the intervals do not cover.
@@ -184,7 +184,7 @@ class Judged:
     interval_shares: dict[str, float]
     against_chance: tuple[AgainstChance, ...]
     noise: dict[str, float]
-    control_steps: int
+    control_steps: int = 0
     missing_terms: tuple[MissingTerm, ...] = ()
     alternatives: tuple[Alternative, ...] = ()
     imitated: tuple[ImitatedTerm, ...] = ()

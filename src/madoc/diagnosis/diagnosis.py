@@ -18,6 +18,7 @@ from madoc.diagnosis.speeds import speed_findings
 from madoc.identification.states import LoggedStates, probing_rows, states_of
 from madoc.robots import Robot
 from madoc.simulation import Simulator
+from madoc.simulation.base import SIMULATED
 from madoc.simulation.sensitivity import insensitive
 
 
@@ -73,37 +74,32 @@ def check(
     findings += range_findings(dataset, simulator)
     about_speeds, late_speeds = speed_findings(dataset, simulator)
     findings += [*about_speeds, *(inertial_findings(dataset, robot, simulator.control_step) if robot else [])]
-    explanation, excitation, spent = None, None, 0
+    explanation, excitation, began = None, None, SIMULATED.control_steps
     if not any(finding.level == "fatal" for finding in findings):
         logged = states_of(dataset, simulator)
-        idle, spent = insensitive(simulator, *probing_rows(logged, dataset, simulator), key=of_rows)
+        idle = insensitive(simulator, *probing_rows(logged, dataset, simulator), key=of_rows)
         findings += _insensitive_findings(idle)
         of_starts, of_draws = jax.random.split(of_box)
         draws = box_draws(len(simulator.parameters), of_draws)
         start = draws[0]
-        responding, steps = response_findings(dataset, simulator, logged, draws, late_speeds=late_speeds)
-        findings, spent = findings + responding, spent + steps
+        responding = response_findings(dataset, simulator, logged, draws, late_speeds=late_speeds)
+        findings += responding
         if logged.kind == "exact":
             explanation = explain(dataset, simulator, logged, draws, key=of_starts)
             points, ahead = draws[[0, explanation.best]], explanation.horizons[min(1, len(explanation.horizons) - 1)]
             scale = typical_change(dataset, simulator.task.attitudes)
-            exchanged, steps = exchanged_columns(dataset, simulator, points, ahead, scale, contradicts=False)
+            exchanged = exchanged_columns(dataset, simulator, points, ahead, scale, contradicts=False)
             findings += [*explanation_findings(explanation, channels, exchanged), *exchanged]
-            spent += steps
             told = frozenset(finding.where for finding in responding)
-            acting, steps = action_findings(dataset, simulator, logged, explanation, told=told, key=of_actions)
-            findings += acting
+            findings += action_findings(dataset, simulator, logged, explanation, told=told, key=of_actions)
             start = explanation.draws[explanation.best]
             excitation = excite(dataset, simulator, logged, start=start, key=of_windows, intervals=intervals)
-            spent += explanation.control_steps + steps
         else:
             findings.append(_inexact_states_finding(logged, robot))
             excitation = excite_unknown(dataset, simulator, logged, intervals=intervals)
-        spent += excitation.control_steps
         findings += excitation_findings(excitation, simulator)
         findings += scale_findings(dataset, simulator, logged, start, only_ratios=excitation.only_ratios)
-        about_timestep, steps = timestep_findings(dataset, simulator, logged, start)
-        findings, spent = findings + about_timestep, spent + steps
+        findings += timestep_findings(dataset, simulator, logged, start)
     return Diagnosis(
         rows=len(dataset),
         episodes=len(dataset.episode_starts),
@@ -113,7 +109,7 @@ def check(
         explanation=explanation,
         excitation=excitation,
         findings=worst_first(findings),
-        control_steps=spent,
+        control_steps=SIMULATED.control_steps - began,
         seconds=time.monotonic() - started,
     )
 

@@ -55,8 +55,8 @@ def exchanged_columns(
     scale: Float[np.ndarray, " observation"],
     *,
     contradicts: bool,
-) -> tuple[tuple[Finding, ...], int]:
-    """A finding on actions or joints whose columns are exchanged or have the other sign, and control steps simulated.
+) -> tuple[Finding, ...]:
+    """A finding on actions or joints whose columns are exchanged or have the other sign.
 
     Args:
         dataset: Rows in their order, whose states are logged at least approximately.
@@ -72,23 +72,22 @@ def exchanged_columns(
         corrections = _corrections(dataset, simulator, exchanged=False)
     count = min(WINDOWS, max(FEWEST_WINDOWS, affordable // max(1, len(corrections))))
     replayed = _replayed(dataset, simulator, steps, count)
-    as_logged, spent = _error(replayed, simulator, points, steps, scale, count)
+    as_logged = _error(replayed, simulator, points, steps, scale, count)
     if as_logged <= _NEGLIGIBLE or not np.isfinite(as_logged):  # of a simulation that fails nothing can be told
-        return (), spent
+        return ()
     better: dict[str, float] = {}
     for correction in corrections:
-        error, more = _error(_put_right(replayed, simulator, correction), simulator, points, steps, scale, count)
-        spent += more
+        error = _error(_put_right(replayed, simulator, correction), simulator, points, steps, scale, count)
         if error < BETTER * as_logged:
             better[correction.mistake] = error
     if not better:
-        return (), spent
+        return ()
     least = min(better.values())
     likely = [mistake for mistake, error in better.items() if BETTER * error <= least]
     what = (
         f"{' or '.join(likely)}; put right, the log is predicted {as_logged / max(least, _NEGLIGIBLE):.2g} times better"
     )
-    return (Finding("warning", what, "columns", "correct the spec or the log", contradicts=contradicts),), spent
+    return (Finding("warning", what, "columns", "correct the spec or the log", contradicts=contradicts),)
 
 
 def _replayed(dataset: Dataset, simulator: Simulator, steps: int, count: int) -> Dataset:
@@ -110,15 +109,15 @@ def _error(
     steps: int,
     scale: Float[np.ndarray, " observation"],
     count: int,
-) -> tuple[float, int]:
-    """The median over windows of the root mean square residual at their end, of the best point; control steps."""
+) -> float:
+    """The median over windows of the root mean square residual at their end, of the best point."""
     states, rows = logged_states(dataset, simulator.task)
     steps = longest_fit(dataset, rows, steps)
     chosen = evenly(first_rows(dataset, rows, steps), count)
     windows = windows_at(dataset, states[chosen], rows[chosen], steps)
     residuals = window_residuals(simulator, windows, points, scale)[..., -len(scale) :]
     sizes = np.nan_to_num(np.sqrt((residuals**2).mean(-1)), nan=np.inf)
-    return float(np.median(sizes, axis=1).min()), len(points) * len(chosen) * steps
+    return float(np.median(sizes, axis=1).min())
 
 
 def _corrections(dataset: Dataset, simulator: Simulator, *, exchanged: bool) -> list[_Correction]:

@@ -61,7 +61,6 @@ class Excitation:
         pairs: Parameters whose estimates would be correlated: two names and the correlation.
         sentences: Which parameters, alone or together, cannot be determined.
         only_ratios: Whether all masses and forces that are calibrated can be scaled alike without a trace.
-        control_steps: Number of control steps simulated.
     """
 
     effect: Float[np.ndarray, " d"]
@@ -69,7 +68,6 @@ class Excitation:
     pairs: tuple[tuple[str, str, float], ...]
     sentences: tuple[str, ...]
     only_ratios: bool
-    control_steps: int
 
 
 def excite(
@@ -91,7 +89,7 @@ def excite(
     of_length = [_excited(dataset, simulator, logged, start=start, windows=each, key=key) for each in lengths.items()]
     spans = simulator.parameters.high - simulator.parameters.low
     widths = [np.nan_to_num(each.half_width / spans, nan=1.0).mean() for each in of_length]
-    return replace(of_length[int(np.argmin(widths))], control_steps=sum(each.control_steps for each in of_length))
+    return of_length[int(np.argmin(widths))]
 
 
 def _excited(
@@ -110,7 +108,7 @@ def _excited(
     chosen, available = drawn(disjoint, windows[1], key), len(disjoint)
     replayed = windows_at(dataset, states[chosen], rows[chosen], steps)
     first = np.clip(start, -0.9 * INSIDE, 0.9 * INSIDE)
-    linearisations, visited, spent = descend(
+    linearisations, visited = descend(
         simulator,
         replayed,
         first,
@@ -123,7 +121,7 @@ def _excited(
     if not linearisations:
         nothing = np.full(len(space), np.nan)
         sentence = f"the simulation fails in all {len(replayed)} stretches tried; look at the ranges and the states"
-        return Excitation(nothing, nothing, (), (sentence,), False, spent)
+        return Excitation(nothing, nothing, (), (sentence,), False)
     at = int(np.argmin([(each.residuals**2).mean() for each in linearisations]))
     best, point = linearisations[at], (first, *visited)[at]
     more = max(1.0, available / len(best.residuals))  # windows of the whole log for each of these
@@ -136,7 +134,6 @@ def _excited(
         pairs=tuple(correlated_pairs(certainty.correlation, space.names)),
         sentences=identifiability(certainty, space.names),
         only_ratios=only_ratios,
-        control_steps=spent,
     )
 
 
@@ -156,25 +153,22 @@ def excite_unknown(dataset: Dataset, simulator: Simulator, logged: LoggedStates,
     certainty = sandwich(bread(around, 1.0, "linear"), np.zeros((len(space), len(space))))
     certainty, only_ratios = _without_scale(certainty, around, middle, space)
     effect = half = np.full(len(space), np.nan)
-    spent = len(points) * len(windows) * windows.steps
     if intervals and logged.kind == "approximate":
         fitted = windows_of(dataset, logged, scale, fewest=FEWEST + len(space), most=FEWEST + len(space))
         fit = fit_log(dataset, logged, simulator, fitted, middle)
         if fit.counted.any():
             noise = noise_of(fit, fitted.readings)
             left = scale[: len(noise)] * noise
-            half, steps = expected_half_widths(logged, dataset, simulator, fit.point, left, exact=False)
-            half, spent = half * (space.high - space.low) / 2.0, spent + steps
+            half = expected_half_widths(logged, dataset, simulator, fit.point, left, exact=False)
+            half = half * (space.high - space.low) / 2.0
             seen = fit.slopes.over(np.tile(noise, fitted.readings.steps + 1)).by_parameters[fit.counted]
             effect = np.sqrt((seen**2).mean((0, 1)))
-        spent += fit.control_steps
     return Excitation(
         effect=effect,
         half_width=half,
         pairs=tuple(correlated_pairs(certainty.correlation, space.names)),
         sentences=identifiability(certainty, space.names),
         only_ratios=only_ratios,
-        control_steps=spent,
     )
 
 

@@ -38,13 +38,11 @@ class Explanation:
         horizons: Numbers of control steps ahead.
         draws: Parameters tried, in [-1, 1]; the first is mid-range, then corners, then draws from the box.
         errors: By draw, horizon and signal; 1 where the simulation failed, NaN for a signal that never moves.
-        control_steps: Number of control steps simulated.
     """
 
     horizons: tuple[int, ...]
     draws: Float[np.ndarray, "draws d"]
     errors: Float[np.ndarray, "draws horizons signals"]
-    control_steps: int
 
     @property
     def overall(self) -> Float[np.ndarray, "draws horizons"]:
@@ -74,7 +72,7 @@ def explain(
     compared = tuple(length for length in lengths if length <= steps) or (steps,)
     windows = windows_at(dataset, states[chosen], rows[chosen], steps)
     errors = _errors(dataset, simulator, windows, rows[chosen], draws, compared)
-    return Explanation(compared, draws, errors, len(draws) * len(windows) * steps)
+    return Explanation(compared, draws, errors)
 
 
 def box_draws(count: int, key: PRNGKeyArray) -> Float[np.ndarray, "draws d"]:
@@ -117,18 +115,17 @@ def action_findings(
     *,
     told: Collection[str] = (),
     key: PRNGKeyArray,
-) -> tuple[list[Finding], int]:
+) -> list[Finding]:
     """Findings on actions that the model explains clearly better if they are a row later or a row earlier.
 
-    Where actions are told of already they are not tried later. The second value is the number of control steps
-    simulated.
+    Where actions are told of already they are not tried later.
     """
     task, (states, rows) = simulator.task, logged.exact()
     at = min(1, len(explanation.horizons) - 1)
     horizon = explanation.horizons[at]
     chosen = drawn(rows_that_fit(dataset, rows, horizon, margin=1), WINDOWS[1], key)
     if not len(chosen):
-        return [], 0
+        return []
     windows = windows_at(dataset, states[chosen], rows[chosen], horizon)
     best = np.argsort(explanation.overall[:, at])[:3]
     draws = explanation.draws[np.unique(np.append(best, 0))]
@@ -147,8 +144,7 @@ def action_findings(
             what = f"the model explains the log clearly better if actions take effect {when}"
             changes.append((action[stretch + shift], Finding("warning", what, "actions", remedy)))
     plain = error(windows.actions)
-    findings = [finding for actions, finding in changes if error(actions) < CLEARLY * plain]
-    return findings, (1 + len(changes)) * len(draws) * len(windows) * horizon
+    return [finding for actions, finding in changes if error(actions) < CLEARLY * plain]
 
 
 def _errors(

@@ -93,7 +93,7 @@ def response_findings(
     points: Float[np.ndarray, "points d"],
     *,
     late_speeds: bool = False,
-) -> tuple[list[Finding], int]:
+) -> list[Finding]:
     """Findings on actions that come late, push the wrong way, or push far more or less than the model can.
 
     Args:
@@ -102,26 +102,23 @@ def response_findings(
         logged: The log's states.
         points: Where in the ranges of the parameters the model's responses are computed.
         late_speeds: Whether logged speeds are known to come late, so that actions seem to as well.
-
-    Returns:
-        The findings, and the number of control steps simulated.
     """
     measured = tuple(one for one in measured_responses(dataset, simulator) if one.certain)
     if not measured:
-        return [], 0
+        return []
     names = action_names(simulator.task)
     findings = []
     if not late_speeds:
         findings = [finding for one in measured for finding in _lag_findings(one, names[one.joint.action], simulator)]
     if not logged.starts_known:
-        return findings, 0
+        return findings
     chosen = evenly(np.arange(len(logged.rows)), _ROWS)
     actions = np.asarray(dataset.transitions.action, np.float64)[logged.rows[chosen]]
     joints = tuple(one.joint for one in measured)
     modelled = responses(simulator, logged.states[chosen], actions, points, joints)
     for one, gains in zip(measured, modelled.T, strict=True):
         findings += _gain_findings(one, names[one.joint.action], gains[np.isfinite(gains)])
-    return findings, 2 * len(joints) * len(points) * len(chosen)
+    return findings
 
 
 def _lag_findings(response: Response, action: str, simulator: Simulator) -> list[Finding]:

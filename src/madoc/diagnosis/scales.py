@@ -100,8 +100,8 @@ def range_findings(dataset: Dataset, simulator: Simulator) -> list[Finding]:
 
 def timestep_findings(
     dataset: Dataset, simulator: Simulator, logged: LoggedStates, point: Float[np.ndarray, " d"]
-) -> tuple[list[Finding], int]:
-    """A warning where a finer integration changes predictions by much, and the control steps simulated.
+) -> list[Finding]:
+    """A warning where a finer integration changes predictions by much.
 
     Args:
         dataset: The log.
@@ -110,16 +110,16 @@ def timestep_findings(
         point: The parameters in [-1, 1] at which both are simulated.
     """
     scale = typical_change(dataset, simulator.task.attitudes)
-    change, spent = coarseness(dataset, logged, simulator, point, scale)
+    change = coarseness(dataset, logged, simulator, point, scale)
     if change <= COARSE:
-        return [], spent
+        return []
     timestep = simulator.control_step / simulator.task.frame_skip
     what = (
         f"its timestep of {timestep:.12g} s is too long: with {timestep / FINER:.12g} s predictions of half of the "
         f"signals change by {change:.2g} typical changes or more, which parameters would make up for"
     )
     remedy = f"give timestep: {timestep / FINER:.12g} in the spec, unless the log is of a simulation with this timestep"
-    return [Finding("warning", what, "the model", remedy)], spent
+    return [Finding("warning", what, "the model", remedy)]
 
 
 def coarseness(
@@ -128,7 +128,7 @@ def coarseness(
     simulator: Simulator,
     point: Float[np.ndarray, " d"],
     scale: Float[np.ndarray, " observation"],
-) -> tuple[float, int]:
+) -> float:
     """By how much predictions one stride ahead change with integration steps of a quarter of the length.
 
     Smooth motion hardly changes. Where contacts begin or end it may, and then parameters fitted to a machine, whose
@@ -143,8 +143,7 @@ def coarseness(
 
     Returns:
         The median over signals of the root mean square over windows of the log, as a signal that hardly moves may
-        change by much of its little. A window whose finer simulation fails is left out; 0 where none is left. Then the
-        control steps simulated.
+        change by much of its little. A window whose finer simulation fails is left out; 0 where none is left.
     """
     windows = probing_windows(logged, dataset, simulator, steps=stride(dataset), count=_WINDOWS)
     finer = simulation.make(simulator.task.with_time_step(1.0 / FINER, substeps=FINER))
@@ -155,5 +154,4 @@ def coarseness(
     counted = np.isfinite(fine).all(-1)
     change = np.abs(fine - coarse)[counted]
     change = np.where(np.isfinite(change), change, _DIVERGED)
-    spent = 2 * len(windows) * windows.steps
-    return (float(np.median(np.sqrt((change**2).mean(0)))) if len(change) else 0.0), spent
+    return float(np.median(np.sqrt((change**2).mean(0)))) if len(change) else 0.0

@@ -45,7 +45,7 @@ def drifts_of(
     fit: Fit,
     point: Float[np.ndarray, " d"],
     names: Sequence[str],
-) -> tuple[list[MissingTerm], list[Alternative], int]:
+) -> tuple[list[MissingTerm], list[Alternative]]:
     """The most significant change of each parameter, and estimates of parts of the log that disagree.
 
     A parameter may change over the log, within each run, as where a drive warms up, from run to run, or in one alone.
@@ -63,26 +63,25 @@ def drifts_of(
         names: Names of the episodes.
 
     Returns:
-        The changes, the other estimates, and the control steps that were simulated.
+        The changes and the other estimates.
     """
-    drifts, spent = list(_drifts(tests)), 0
+    drifts = list(_drifts(tests))
     others = list(_of_parts(drifts))
     between, covering = _between_runs(tests)
     others += covering
     disagreeing = dict.fromkeys(term.parameter for term in drifts if term.cause == DRIFT and abs(term.t) >= DISAGREEING)
     if disagreeing:
         time = np.linspace(-1.0, 1.0, len(readings))
-        thirds, spent = _fitted_parts(simulator, readings, fit, [time < -1.0 / 3.0, time > 1.0 / 3.0])
+        thirds = _fitted_parts(simulator, readings, fit, [time < -1.0 / 3.0, time > 1.0 / 3.0])
         if len(thirds) == 2:
             drifts += list(_changes(tests, thirds, drifts))
             others += _of_fitted_parts(tests, thirds, disagreeing, point)
     differing = [term.parameter for term in between if term.t >= SUSPICIOUS]
     if differing:
         single = [runs == run for run in np.unique(runs)]
-        fitted, of_runs = _fitted_parts(simulator, readings, fit, single, fewest=FEWEST_OF_A_RUN)
+        fitted = _fitted_parts(simulator, readings, fit, single, fewest=FEWEST_OF_A_RUN)
         others += _of_fitted_runs(tests, fitted, differing, point)
-        spent += of_runs
-    return list(_most_certain([*drifts, *between, *_in_one_run(tests, names)])), others, spent
+    return list(_most_certain([*drifts, *between, *_in_one_run(tests, names)])), others
 
 
 def is_change(cause: str) -> bool:
@@ -186,21 +185,21 @@ def _fitted_parts(
     parts: Iterable[Bool[np.ndarray, " windows"]],
     *,
     fewest: int = FEWEST,
-) -> tuple[list[_Part], int]:
-    """Estimates of the parts of the log with `fewest` windows more than parameters, and the control steps simulated."""
-    found, spent = list[_Part](), 0
+) -> list[_Part]:
+    """Estimates of the parts of the log with `fewest` windows more than parameters."""
+    found = list[_Part]()
     for part in parts:
         if part.sum() < fewest + len(fit.point):
             continue
         own_readings = readings.of(np.flatnonzero(part))
         own = fit_windows(simulator, own_readings, fit.states[part], fit.point)
-        products, spent = products_of(own.slopes, own_readings, len(own.point)), spent + own.control_steps
+        products = products_of(own.slopes, own_readings, len(own.point))
         if products is None or len(products) < fewest + len(own.point):
             continue
         step, covariance = parameter_shift(products)
         point, variance = np.clip(own.point + step, -1.0, 1.0), np.maximum(np.diag(covariance), 0.0)
         found.append(_Part(point, variance, len(products) - 1))
-    return found, spent
+    return found
 
 
 def _changes(tests: TermTests, thirds: list[_Part], drifts: Iterable[MissingTerm]) -> Iterator[MissingTerm]:

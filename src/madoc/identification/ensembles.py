@@ -338,17 +338,16 @@ def with_contacts_settled(
     rows: Int[np.ndarray, " windows"],
     point: Float[np.ndarray, " d"],
     guesses: Float[np.ndarray, "windows state"],
-) -> tuple[Float[np.ndarray, "windows state"], int]:
-    """Initial states from near which those of single windows can be fitted, and the control steps that it took.
+) -> Float[np.ndarray, "windows state"]:
+    """Initial states from near which those of single windows can be fitted.
 
     Where windows begin in contact, the best of many states that are as likely as the readings before each window is
     taken, and settles (`settled_to_noise`): what states in wrong minima leave would pass for what the model lacks.
     """
-    (likely,), spent = likely_states(dataset, logged, simulator, readings, rows, point[None], guesses)
+    (likely,) = likely_states(dataset, logged, simulator, readings, rows, point[None], guesses)
     if not _touch(simulator, point, guesses):
-        return likely, spent
-    after = settled_to_noise(simulator, readings, point, likely)
-    return after.states, spent + after.simulations * readings.steps
+        return likely
+    return settled_to_noise(simulator, readings, point, likely).states
 
 
 def _touch(simulator: Simulator, point: Float[np.ndarray, " d"], states: Float[np.ndarray, "windows state"]) -> bool:
@@ -366,16 +365,16 @@ def likely_states(
     rows: Int[np.ndarray, " windows"],
     points: Float[np.ndarray, "systems d"],
     guesses: Float[np.ndarray, "windows state"],
-) -> tuple[Float[np.ndarray, "systems windows state"], int]:
+) -> Float[np.ndarray, "systems windows state"]:
     """The guess of each window's first state, or that of an ensemble's states there which fits the window better.
 
     Each system takes the states that fit best under its parameters, of one ensemble for all: it is the last system's,
     and has followed the readings before the window, where its episode has as many. Guesses are left as they are where
-    nothing touches, and where states are unknown. Also the control steps.
+    nothing touches, and where states are unknown.
     """
     point = points[-1]
     if not (logged.starts_known and _touch(simulator, point, guesses)):
-        return np.repeat(guesses[None], len(points), axis=0), 0
+        return np.repeat(guesses[None], len(points), axis=0)
     before = min(BEFORE * stride(dataset), MOST_BEFORE)
     random, first = np.random.default_rng(0), rows - before
     noise = np.maximum(difference_noise(dataset)[: logged.measured] / readings.scale, LEAST_NOISE)
@@ -395,5 +394,4 @@ def likely_states(
     starts = np.swapaxes(tried, 0, 1).reshape(1, -1, guesses.shape[1])
     residuals = readings.residuals(simulator, points, np.repeat(starts, len(points), axis=0))
     best = window_costs(residuals / np.tile(noise, readings.steps + 1), "cauchy").argmin(1)
-    spent = NOISE_ROUNDS * len(begun) * DRAWN * before + len(points) * len(rows) * (1 + DRAWN) * readings.steps
-    return tried[np.arange(len(rows)), best], spent
+    return tried[np.arange(len(rows)), best]

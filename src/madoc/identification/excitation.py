@@ -26,8 +26,8 @@ def expected_half_widths(
     noise: Float[np.ndarray, " observation"],
     *,
     exact: bool,
-) -> tuple[Float[np.ndarray, " d"], int]:
-    """Half of each parameter's smallest possible 95 % interval in [-1, 1], and the control steps simulated.
+) -> Float[np.ndarray, " d"]:
+    """Half of each parameter's smallest possible 95 % interval in [-1, 1].
 
     It is computed from the Fisher information at `point`, as if the noise of all observations were independent, plus
     the prior information of the box: of single steps from logged states if these are `exact`, else of windows whose
@@ -44,7 +44,7 @@ def expected_half_widths(
     if exact:
         points = difference_points(point)
         slopes = linearise(points, window_residuals(simulator, windows, points, noise)).jacobian
-        spent, share = len(points) * len(windows), len(dataset) / max(1, len(slopes))
+        share = len(dataset) / max(1, len(slopes))
     else:
         readings = Readings(
             windows.actions,
@@ -54,12 +54,10 @@ def expected_half_widths(
         )
         (around,) = slopes_at(simulator, readings, point[None], windows.states[None])
         slopes = eliminate(around, np.ones_like(around.residuals)).reduced.jacobian
-        columns = 1 + 2 * len(point) + logged.physical_size
-        spent = columns * len(windows) * windows.steps
         share = len(dataset) / windows.steps / max(1, int(around.whole.sum()))
     flat = slopes.reshape(-1, len(point))
     information = flat.T @ flat * share + np.eye(len(point)) / BOX_VARIANCE
-    return NORMAL_95 * np.sqrt(np.diag(widened(np.linalg.inv(information)))), spent
+    return NORMAL_95 * np.sqrt(np.diag(widened(np.linalg.inv(information))))
 
 
 def widened(covariance: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"]:

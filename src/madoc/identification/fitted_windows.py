@@ -124,7 +124,6 @@ class Fit:
             simulated.
         explicable: Orthonormal columns that span what initial states explain of residuals, to first order there.
         counted: Windows whose simulation succeeded there.
-        control_steps: Control steps simulated so far.
     """
 
     point: Float[np.ndarray, " d"]
@@ -132,7 +131,6 @@ class Fit:
     slopes: WindowSlopes
     explicable: Float[np.ndarray, "windows values n"]
     counted: Bool[np.ndarray, " windows"]
-    control_steps: int
 
     @cached_property
     def left(self) -> Float[np.ndarray, "windows values"]:
@@ -165,9 +163,8 @@ def fit_log(
 ) -> Fit:
     """`fit_windows` from what the log tells of initial states, of which those in contact settle first."""
     readings = windows.readings
-    states, spent = with_contacts_settled(dataset, logged, simulator, readings, windows.rows, point, windows.states)
-    fit = fit_windows(simulator, readings, states, point)
-    return replace(fit, control_steps=spent + fit.control_steps)
+    states = with_contacts_settled(dataset, logged, simulator, readings, windows.rows, point, windows.states)
+    return fit_windows(simulator, readings, states, point)
 
 
 def fit_windows(
@@ -184,16 +181,14 @@ def fit_windows(
     more at the parameters found, so that outlying readings count little.
     """
     unknown = np.zeros((len(readings), readings.observed[0].size, len(point)))
-    fit = _settled(simulator, readings, _sloped(simulator, readings, states, point, 0, by_parameters=unknown))
+    fit = _settled(simulator, readings, _sloped(simulator, readings, states, point, by_parameters=unknown))
     fit = _sloped_by_parameters(simulator, readings, fit)
     for _ in range(LINEARISATIONS):
         moved = _descended(simulator, readings, fit)
         if not moved.gains_on(fit):
-            fit = replace(fit, control_steps=moved.control_steps)
             break
-        fresh = _sloped(simulator, readings, moved.states, moved.point, moved.control_steps)
+        fresh = _sloped(simulator, readings, moved.states, moved.point)
         if not fresh.gains_on(fit):
-            fit = replace(fit, control_steps=fresh.control_steps)
             break
         fit = fresh
     settled = _settled(simulator, readings, fit)
@@ -205,30 +200,25 @@ def _sloped(
     readings: Readings,
     states: Float[np.ndarray, "windows state"],
     point: Float[np.ndarray, " d"],
-    spent: int,
     *,
     by_parameters: Float[np.ndarray, "windows values d"] | None = None,
 ) -> Fit:
-    """Residuals and their derivatives simulated at a point, after `spent` control steps.
+    """Residuals and their derivatives simulated at a point.
 
     Derivatives by parameters are not simulated where they are given.
     """
-    known = by_parameters is not None
-    (slopes,) = slopes_at(simulator, readings, point[None], states[None], parameters=not known)
-    columns = 1 + len(readings.spread) + (0 if known else 2 * len(point))
+    (slopes,) = slopes_at(simulator, readings, point[None], states[None], parameters=by_parameters is None)
     if by_parameters is not None:
         slopes = replace(slopes, by_parameters=np.where(slopes.whole[:, None, None], by_parameters, 0.0))
-    spent += columns * len(readings) * readings.steps
-    return Fit(point, states, slopes, _explicable(slopes), slopes.whole, spent)
+    return Fit(point, states, slopes, _explicable(slopes), slopes.whole)
 
 
 def _sloped_by_parameters(simulator: Simulator, readings: Readings, fit: Fit) -> Fit:
     """The fit with derivatives by parameters simulated anew; windows that fail there are left out."""
     (slopes,) = slopes_at(simulator, readings, fit.point[None], fit.states[None], initial_states=False)
-    spent = fit.control_steps + (1 + 2 * len(fit.point)) * len(readings) * readings.steps
     residuals = np.where(slopes.whole[:, None], fit.slopes.residuals, np.nan)
     both = replace(fit.slopes, by_parameters=slopes.by_parameters).at(residuals)
-    return replace(fit, slopes=both, counted=fit.counted & slopes.whole, control_steps=spent)
+    return replace(fit, slopes=both, counted=fit.counted & slopes.whole)
 
 
 def _explicable(slopes: WindowSlopes) -> Float[np.ndarray, "windows values n"]:
@@ -247,7 +237,7 @@ def _descended(simulator: Simulator, readings: Readings, fit: Fit) -> Fit:
             break
         moved = _stepped(simulator, readings, fit)
         if not moved.gains_on(fit):
-            return replace(fit, control_steps=moved.control_steps)
+            break
         fit = moved
     return fit
 
@@ -263,12 +253,11 @@ def _stepped(simulator: Simulator, readings: Readings, fit: Fit) -> Fit:
     points = fit.point + LENGTHS[:, None] * whole_step
     states = fit.states + LENGTHS[:, None, None] * of_states
     residuals = readings.residuals(simulator, points, states)[:, 0]
-    spent = fit.control_steps + len(LENGTHS) * len(readings) * readings.steps
     tried = [
-        replace(fit, point=point, states=state, slopes=slopes.at(residual), control_steps=spent)
+        replace(fit, point=point, states=state, slopes=slopes.at(residual))
         for point, state, residual in zip(points, states, residuals, strict=True)
     ]
-    return min([replace(fit, control_steps=spent), *tried], key=lambda each: each.unexplained)
+    return min([fit, *tried], key=lambda each: each.unexplained)
 
 
 def _settled(simulator: Simulator, readings: Readings, fit: Fit) -> Fit:
@@ -280,7 +269,7 @@ def _settled(simulator: Simulator, readings: Readings, fit: Fit) -> Fit:
         if not abs(fit.unexplained - before) > GAIN * before:
             break
         kept = fit.slopes.by_parameters
-        fit = _sloped(simulator, readings, fit.states, fit.point, fit.control_steps, by_parameters=kept)
+        fit = _sloped(simulator, readings, fit.states, fit.point, by_parameters=kept)
     return fit
 
 
@@ -298,8 +287,7 @@ def _with_fitted_states(simulator: Simulator, readings: Readings, fit: Fit) -> F
         before, now = _costs(scaled.residuals), _costs(after / noise)
         better = slopes.whole & (now < before)
         kept = replace(slopes, residuals=np.where(better[:, None], after, slopes.residuals))
-        spent = fit.control_steps + len(readings) * readings.steps
-        fit = replace(fit, states=np.where(better[:, None], moved, states), slopes=kept, control_steps=spent)
+        fit = replace(fit, states=np.where(better[:, None], moved, states), slopes=kept)
         if before[better].sum() - now[better].sum() <= GAIN * before[slopes.whole].sum():
             break
     return fit

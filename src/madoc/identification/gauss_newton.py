@@ -123,20 +123,19 @@ def descend(
     damping: float,
     limit: float = 1.0,
     shortest: float = 0.0,
-) -> tuple[list[Linearisation], Float[np.ndarray, "steps d"], int]:
+) -> tuple[list[Linearisation], Float[np.ndarray, "steps d"]]:
     """Take Gauss-Newton steps from `start` on windows whose initial states are known.
 
     There are at most `steps` of them. They end early where every simulation fails, and after a step whose components
     are all smaller than `shortest`.
 
     Returns:
-        The linearisation before each step, the point after it, and the number of control steps simulated.
+        The linearisation before each step, and the point after it.
     """
-    linearisations, visited, point, spent = [], list[Float[np.ndarray, " d"]](), start, 0
+    linearisations, visited, point = [], list[Float[np.ndarray, " d"]](), start
     for _ in range(steps):
         points = difference_points(point)
         around = linearise(points, window_residuals(simulator, windows, points, scale))
-        spent += len(points) * len(windows) * windows.steps
         if not len(around.residuals):
             break
         factors = triangular_factors(around, scale_of(around.residuals, loss), loss)
@@ -146,7 +145,7 @@ def descend(
         visited.append(point)
         if np.abs(step).max() < shortest:
             break
-    return linearisations, np.array(visited).reshape(-1, len(start)), spent
+    return linearisations, np.array(visited).reshape(-1, len(start))
 
 
 @dataclass(frozen=True)

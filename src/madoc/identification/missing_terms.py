@@ -47,7 +47,7 @@ from madoc.identification.term_tests import (
 )
 from madoc.identification.unlisted_forces import families, unlisted_forces
 from madoc.parameters import FIELDS, ParameterSpace
-from madoc.simulation.base import Simulator
+from madoc.simulation.base import SIMULATED, Simulator
 
 TOGETHER = 4
 """Largest number of terms whose common effect on the estimate is computed."""
@@ -113,20 +113,20 @@ def suspicions(
         most: Largest number of windows; None for the usual one.
         shorter: How many times as short and as many windows are.
     """
+    began = SIMULATED.control_steps
     windows = windows_of(dataset, logged, scale, fewest=2 * (FEWEST + len(point)), most=most, shorter=shorter)
     readings, runs = windows.readings, windows.runs
     if len(readings) < FEWEST + len(point):
         return Suspicions(tested=False)
     led = (fit := fit_log(dataset, logged, simulator, windows, point)).point
     responses = responses_of(simulator, readings, fit.point, fit.states, fit.slopes.whole)
-    tried, by_terms, simulated = _effects(logged, simulator, windows, fit, scale, responses)
-    spent = fit.control_steps + (1 + simulated) * len(readings) * readings.steps + responses.control_steps
+    tried, by_terms = _effects(logged, simulator, windows, fit, scale, responses)
     both = replace(fit.slopes, by_parameters=np.concatenate([fit.slopes.by_parameters, by_terms], axis=-1))
     products, counted = products_of(both, readings, len(led)), both.finite
     if products is None or len(products) < FEWEST + len(led):
-        return Suspicions(control_steps=spent, tested=negligible(both))
+        return Suspicions(control_steps=SIMULATED.control_steps - began, tested=negligible(both))
     tests = TermTests(products, tuple(tried), simulator.parameters, half_widths, runs[counted])
-    drifts, others, of_parts = drifts_of(tests, simulator, readings, runs, fit, point, dataset.names_of_runs)
+    drifts, others = drifts_of(tests, simulator, readings, runs, fit, point, dataset.names_of_runs)
     terms = [*_terms(tests), *_below_minimum(tests, led), *drifts]
     unlisted, covering = unlisted_forces(tests, families(simulator, responses), readings, fit, by_terms, responses)
     terms, others = [*terms, *unlisted], [*others, *covering]
@@ -136,13 +136,13 @@ def suspicions(
             shifts = np.array([other.shifts.get(name, 0.0) for name in tests.space.names])
             tests = replace(tests, moved=shifts * half_widths)
     chosen = _chosen(tests)
-    fitted, with_chosen, of_fit = _of_chosen(tests, chosen, simulator, readings, fit, point)
+    fitted, with_chosen = _of_chosen(tests, chosen, simulator, readings, fit, point)
     terms = [fitted.get(term.parameter, term) for term in terms]
     others += [*with_chosen, *_of_friction(tests, chosen), *_of_forces(tests, chosen)]
     most_significant_first = sorted(terms, key=lambda term: -abs(term.t))
     where = concentration(dataset, windows, fit, simulator.task.signal_names, simulator.control_step)
     found = tuple(most_significant_first), tuple(others), tuple(imitated_terms(tests))
-    return Suspicions(*found, spent + of_parts + of_fit, concentration=where, alike=alike(fit, readings))
+    return Suspicions(*found, SIMULATED.control_steps - began, concentration=where, alike=alike(fit, readings))
 
 
 def _effects(
@@ -152,11 +152,8 @@ def _effects(
     fit: Fit,
     scale: Float[np.ndarray, " observation"],
     responses: Responses,
-) -> tuple[list[Candidate], Float[np.ndarray, "windows values terms"], int]:
-    """Every candidate and the derivative of the residuals by it, 0 for one that most windows cannot bear.
-
-    Also how often every window was simulated.
-    """
+) -> tuple[list[Candidate], Float[np.ndarray, "windows values terms"]]:
+    """Every candidate and the derivative of the residuals by it, 0 for one that most windows cannot bear."""
     readings, added = windows.readings, list(candidates(logged, simulator, fit.point, scale))
     space = ParameterSpace((*simulator.parameters.parameters, *(parameter for _, parameter in added)))
     wide = simulation.make(replace(simulator.task, parameters=space))
@@ -164,11 +161,11 @@ def _effects(
     tried, by_terms = effects(simulator, wide, readings, windows.before, at_nominal, fit.states, added)
     whole = fit.slopes.whole
     forces, by_forces = force_effects(simulator, logged, responses, windows.earlier)
-    simulated, by_terms = len(tried), np.concatenate([by_terms, by_forces], axis=-1)
+    by_terms = np.concatenate([by_terms, by_forces], axis=-1)
     if whole.any():
         diverges = (~np.isfinite(by_terms).all(1)[whole]).mean(0) > DIVERGING
         by_terms[..., diverges] = 0.0  # so that others are tested
-    return [*tried, *forces], by_terms, simulated
+    return [*tried, *forces], by_terms
 
 
 def _of_chosen(
@@ -178,32 +175,22 @@ def _of_chosen(
     readings: Readings,
     fit: Fit,
     point: Float[np.ndarray, " d"],
-) -> tuple[dict[str, MissingTerm], list[Alternative], int]:
-    """The estimates with the chosen terms, with their rivals, and with one more; also the control steps simulated.
+) -> tuple[dict[str, MissingTerm], list[Alternative]]:
+    """The estimates with the chosen terms, with their rivals, and with one more.
 
     The terms are fitted together with the parameters where they move these by much: the fitted ones come first, by the
     name of their parameter.
     """
     if not chosen:
-        return {}, [], 0
-    together, richer = _with_terms(tests, chosen), None
+        return {}, []
+    together, terms, others = _with_terms(tests, chosen), dict[str, MissingTerm](), list[Alternative]()
     if max(map(abs, together.shifts.values())) >= WORTH_FITTING:
-        richer = _fitted(tests, chosen, simulator, readings, fit, point)
-    others = [] if richer is None else [richer.alternative]
-    if richer is None or len(richer.terms) < len(chosen):
+        terms, others = _fitted(tests, chosen, simulator, readings, fit, point)
+    if len(terms) < len(chosen):
         others.append(together)
     further = [*_rivals(tests, chosen), *_further(tests, chosen)]
     others += [_with_terms(tests, rivals) for rivals in further]
-    return ({}, others, 0) if richer is None else (richer.terms, others, richer.control_steps)
-
-
-@dataclass(frozen=True)
-class _RicherModel:
-    """Terms by the name of their parameter, fitted together with the parameters, and the estimate with them."""
-
-    terms: dict[str, MissingTerm]
-    alternative: Alternative
-    control_steps: int
+    return terms, others
 
 
 def _terms(tests: TermTests) -> Iterator[MissingTerm]:
@@ -314,8 +301,8 @@ def _fitted(
     readings: Readings,
     without: Fit,
     point: Float[np.ndarray, " d"],
-) -> _RicherModel | None:
-    """The first of these terms fitted together with the parameters; None if a spec can say none of them.
+) -> tuple[dict[str, MissingTerm], list[Alternative]]:
+    """The first of these terms fitted together with the parameters, and the estimate; none if a spec can say no term.
 
     A score test is one linear step, which is too short where residuals are far from noise and so count little.
     `without` is the fit without the terms.
@@ -328,7 +315,7 @@ def _fitted(
         if (found := tests.score(index)) is not None and (parameter := tests.tried[index].added(found)) is not None
     ][:MOST_FITTED]
     if not possible:
-        return None
+        return {}, []
     space = ParameterSpace((*tests.space.parameters, *(parameter for _, parameter, _ in possible)))
     wide = simulation.make(replace(simulator.task, parameters=space))
     values = np.array([candidate.nominal + change * candidate.reference for candidate, _, change in possible])
@@ -337,7 +324,7 @@ def _fitted(
     fit = fit_windows(wide, readings, without.states, np.clip(start, -1.0, 1.0))
     at, products = fit.point, products_of(fit.slopes, readings, len(fit.point))
     if products is None:
-        return None
+        return {}, []
     step, covariance = parameter_shift(products)
     at, error = at + step, np.sqrt(np.maximum(np.diag(covariance), 0.0))
     alone = np.sqrt(np.maximum(np.diag(parameter_shift(tests.products)[1]), 0.0))
@@ -352,7 +339,7 @@ def _fitted(
             term = replace(term_of(candidate, found, shifts), value=value, standard_error=deviation, t=significance)
             terms[candidate.parameter] = term
     causes = tuple(named(candidate) for candidate, _, _ in possible)
-    return _RicherModel(terms, Alternative(causes, shifts, tests.by_name(beyond)), fit.control_steps)
+    return terms, [Alternative(causes, shifts, tests.by_name(beyond))]
 
 
 def _of_friction(tests: TermTests, chosen: list[int]) -> Iterator[Alternative]:

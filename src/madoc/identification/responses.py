@@ -31,7 +31,6 @@ class Responses:
         carried: Derivatives of (positions, velocities) after a control step by those before it.
         pushed: The same by a force on each degree of freedom, in N or N·m.
         seen: Derivatives of each reading, over the typical changes of its channels, by (positions, velocities).
-        control_steps: Control steps simulated.
     """
 
     motion: Float[np.ndarray, "windows steps state"]
@@ -39,7 +38,6 @@ class Responses:
     carried: Float[np.ndarray, "windows steps both both"]
     pushed: Float[np.ndarray, "windows steps both dof"]
     seen: Float[np.ndarray, "windows readings channels both"]
-    control_steps: int
 
     def effects(
         self, forces: Float[np.ndarray, "windows steps dof terms"]
@@ -108,5 +106,4 @@ def responses_of(
         by_window(carried, widths, readings.steps),
         by_window(pushed, by_force, readings.steps),
         by_window(seen, widths, readings.steps + 1),
-        (2 + 3 * model.nv) * len(readings) * readings.steps,
     )

@@ -62,7 +62,6 @@ class Settled:
         deviation: Noise of each channel, in its typical changes: what no initial state explains, to first order.
         costs: Mean loss of each window's residuals after the step, in squared standard deviations of the noise.
         failures: Windows whose simulation failed before it.
-        simulations: Simulations of a window that it took.
     """
 
     states: Float[np.ndarray, "windows state"]
@@ -71,7 +70,6 @@ class Settled:
     deviation: Float[np.ndarray, " channels"]
     costs: Float[np.ndarray, " windows"]
     failures: int
-    simulations: int
 
     def unexplained(self, values: int, loss: Loss) -> Bool[np.ndarray, " windows"]:
         """Windows of so many values whose residuals are more than noise."""
@@ -113,7 +111,6 @@ def settle(
         deviation=deviation,
         costs=costs.min(0),
         failures=int((~slopes.whole).sum()),
-        simulations=len(readings) * (1 + len(width) + len(TRIALS)),
     )
 
 
@@ -140,23 +137,17 @@ def restart(
         size = FARTHEST ** random.random((len(worse), 1)) * before.errors
         error = np.minimum(size, 1.0) * random.standard_normal(error.shape)
     states = guesses[worse] + readings.in_state_units(error, guesses.shape[1])
-    damping, simulations = np.full(len(worse), FIRST_DAMPING), 0
+    damping = np.full(len(worse), FIRST_DAMPING)
     for width in WIDTHS:
         after = settle(simulator, part, point, states, damping, width * before.errors, loss)
-        states, damping, simulations = after.states, after.damping, simulations + after.simulations
+        states, damping = after.states, after.damping
     residuals = part.residuals(simulator, point[None], states[None])[0, 0]
     costs = window_costs(residuals / np.tile(before.deviation, readings.steps + 1), loss)
     better = costs < before.costs[worse]
     new_states, new_damping, new_costs = before.states.copy(), before.damping.copy(), before.costs.copy()
     chosen = worse[better]
     new_states[chosen], new_damping[chosen], new_costs[chosen] = states[better], damping[better], costs[better]
-    return replace(
-        before,
-        states=new_states,
-        damping=new_damping,
-        costs=new_costs,
-        simulations=before.simulations + simulations + len(worse),
-    )
+    return replace(before, states=new_states, damping=new_damping, costs=new_costs)
 
 
 def settled(
@@ -169,16 +160,9 @@ def settled(
 ) -> Settled:
     """Initial states after steps by differences of these widths, in standard errors, and so many new beginnings."""
     states, damping, errors = guesses, np.full(len(guesses), FIRST_DAMPING), np.zeros(len(readings.spread))
-    simulations = 0
     for width in widths:
         after = settle(simulator, readings, point, states, damping, width * errors, "cauchy")
-        states, damping, errors, simulations = (
-            after.states,
-            after.damping,
-            after.errors,
-            simulations + after.simulations,
-        )
-    after = replace(after, simulations=simulations)
+        states, damping, errors = after.states, after.damping, after.errors
     for again in range(anew):
         after = restart(simulator, readings, point, guesses, after, "cauchy", np.random.default_rng(again))
     return after

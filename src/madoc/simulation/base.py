@@ -1,5 +1,6 @@
 """What a simulator backend provides: a simulator binds parameters, and the systems it returns step states."""
 
+import threading
 from collections.abc import Mapping
 from typing import Protocol, runtime_checkable
 
@@ -9,6 +10,15 @@ from jaxtyping import Float, Int
 
 from madoc.parameters import ParameterSpace
 from madoc.tasks.base import Task
+
+
+class _Simulated(threading.local):
+    control_steps = 0
+
+
+SIMULATED = _Simulated()
+"""The control steps, each of one row, that systems have simulated in this thread. What a part of the work took is a
+difference; systems add to it, and nothing else does."""
 
 
 @runtime_checkable

@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from madoc.errors import MadocError, listed
 from madoc.parameters import FIELDS
 from madoc.runs.machine import usable_cores
+from madoc.simulation.base import SIMULATED
 from madoc.simulation.delay import LAGS, action_weights, blend
 from madoc.simulation.drives import drive_forces
 from madoc.simulation.touching import collided
@@ -239,6 +240,7 @@ class CpuSystem:
         """
         self._check_shapes(state.shape, (*actions.shape[:2], *actions.shape[3:]))
         (count, rows, steps, _), pending = actions.shape, self._simulator.task.pending
+        SIMULATED.control_steps += count * rows * steps
         values = 1 + self._physical + self.models[0].nu + self.models[0].nv + (2 + pending) * actions.shape[-1]
         most = _VALUES_AT_ONCE // max(1, count * steps * self._simulator.task.frame_skip * values)
         if most >= rows:

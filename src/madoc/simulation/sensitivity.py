@@ -18,27 +18,23 @@ def insensitive(
     actions: Float[np.ndarray, "logged action"],
     *,
     key: PRNGKeyArray,
-) -> tuple[list[str], int]:
-    """Parameters that change no bit of any next state or observation at either end of their range.
+) -> list[str]:
+    """The names of parameters that change no bit of any next state or observation at either end of their range.
 
     All other parameters stay at mid-range. At most the last of `ROWS` logged rows are drawn without repetition, and a
     row counts only where both simulations succeeded. No rows, or rows that all fail at mid-range, are refused.
-
-    Returns:
-        The names, in the order of the parameters, and the control steps spent.
     """
     if not len(states):
         raise MadocError("expected at least one logged state to test the parameters at, got none")
     order = generator(key).permutation(len(states))
-    left, spent, before = list(range(len(simulator.parameters))), 0, 0
+    left, before = list(range(len(simulator.parameters))), 0
     for rows in ROWS:
         chosen, before = order[before:rows], rows
         if not left or not len(chosen):
             break
         changed = _changed(simulator, states[chosen], actions[chosen], left)
-        spent += (1 + 2 * len(left)) * len(chosen)
         left = [index for index, felt in zip(left, changed, strict=True) if not felt]
-    return [simulator.parameters.names[index] for index in left], spent
+    return [simulator.parameters.names[index] for index in left]
 
 
 def _changed(
@@ -73,15 +69,14 @@ def refuse_insensitive(
     actions: Float[np.ndarray, "logged action"],
     *,
     key: PRNGKeyArray,
-) -> int:
-    """Check that every parameter changes some next state; returns the control steps spent on it.
+) -> None:
+    """Check that every parameter changes some next state.
 
     Raises:
         MadocError: A parameter changes none, so no method could calibrate it.
     """
-    names, control_steps = insensitive(simulator, states, actions, key=key)
+    names = insensitive(simulator, states, actions, key=key)
     if names:
         what = f"parameter {names[0]} changes" if len(names) == 1 else f"parameters {', '.join(names)} change"
         remedy = "remove it or widen its range" if len(names) == 1 else "remove them or widen their ranges"
         raise MadocError(f"{what} no next state in {min(ROWS[-1], len(states)):,} logged rows; {remedy}")
-    return control_steps

@@ -13,7 +13,7 @@ from madoc.calibration.holdout import HoldOut, OpenLoop, ToldApart, Verdict
 from madoc.data import Dataset
 from madoc.errors import MadocError
 from madoc.runs.machine import one_blas_thread
-from madoc.simulation.base import Simulator
+from madoc.simulation.base import SIMULATED, Simulator
 from madoc.verdict.adequacy import about_imitated, with_widened_intervals
 from madoc.verdict.bench import Bench
 from madoc.verdict.fitted import fitted
@@ -78,7 +78,7 @@ def assess(
             f"{', '.join(bench.simulator.parameters.names)}"
         )
     bench.left_out.clear()
-    began = time.monotonic()
+    began, simulated = time.monotonic(), SIMULATED.control_steps
     point = np.clip(bench.simulator.parameters.to_unit(result.mean), -1.0, 1.0)
     bench.tell("predictions of single steps and short windows")
     fits_starts = _fits_starts(bench, point)
@@ -92,7 +92,8 @@ def assess(
     if predictions is None:
         noise = np.array(list(holdout.noise.values())) / bench.change[: len(holdout.noise)]
         predictions = predict(noise)
-    holdout = replace(holdout, open_loop=predictions, tested=holdout.tested and LATER not in bench.left_out)
+    tested, simulated = holdout.tested and LATER not in bench.left_out, SIMULATED.control_steps - simulated
+    holdout = replace(holdout, open_loop=predictions, tested=tested, control_steps=simulated)
     widened = with_widened_intervals(result, holdout)
     verdict = judge(
         holdout,
@@ -135,7 +136,7 @@ def measured(
     noise = bench.problem.noise_by_differences / bench.change
     areas = bench.area_at_mid_range, bench.area_of_rollouts(point)
     record = partial(ToldApart, area_at_mid_range=areas[0], area_at_estimate=areas[1])
-    return judged(record, bench, point, interval, at=point, residual=noise, by_model=(), noise=noise, control_steps=0)
+    return judged(record, bench, point, interval, at=point, residual=noise, by_model=(), noise=noise)
 
 
 def _fits_starts(bench: Bench, point: Float[np.ndarray, " d"]) -> bool:

@@ -121,7 +121,7 @@ def _fitted(
     logged, moving, episodes = states_of(held, model), stride(bench.problem.dataset), held.episode_of(first)
     readings = Readings.at(held, logged, first, steps, bench.change)
     replays = FittedReplays(held, logged, model, readings, states, first, episodes, moving, ())
-    return replays.starts(point[None])[0][0]
+    return replays.starts(point[None])[0]
 
 
 def replay_errors(

@@ -34,16 +34,14 @@ def fitted(
 ) -> Fitted:
     """The errors of an estimate, in [-1, 1], of mid-range, of the best parameters nearby, and of noise alone."""
     given = np.stack([np.zeros(len(point)), point])
-    starts, fitting = replays.starts(given)
-    nearby, searching = _nearby_best(replays, point, starts[1])
+    starts = replays.starts(given)
+    nearby = _nearby_best(replays, point, starts[1])
     points = np.concatenate([given, nearby])
-    beside, predicting = replays.residuals(nearby, starts[1])
-    residuals = np.concatenate([replays.residuals_from(given, starts), beside])
-    predicting += fitting + len(given) * len(replays.readings) * replays.readings.steps
+    residuals = np.concatenate([replays.residuals_from(given, starts), replays.residuals(nearby, starts[1])])
     sizes = magnitudes(replays.at_horizons(residuals))
     best = best_of(sizes)
     noise = residual_noise(residuals[best][:, : replays.fitted + 1], len(replays.readings.spread))
-    alone, comparing = _with_noise_alone(bench, replays, points[best], residuals[best], noise)
+    alone = _with_noise_alone(bench, replays, points[best], residuals[best], noise)
     observed, actions = replays.readings.observed, replays.readings.actions
     start_and_actions = np.concatenate([observed[:, 0], observed[:, 1], actions.reshape(len(actions), -1)], axis=1)
     record = partial(
@@ -70,7 +68,6 @@ def fitted(
         residual=noise,
         by_model=(_against_chance(replays, residuals[best]),),
         noise=noise,
-        control_steps=searching + predicting + comparing,
     )
 
 
@@ -80,11 +77,8 @@ def _with_noise_alone(
     point: Float[np.ndarray, " d"],
     residuals: Float[np.ndarray, "windows readings channels"],
     deviation: Float[np.ndarray, " channels"],
-) -> tuple[Float[np.ndarray, "1 windows readings channels"], int]:
-    """Residuals of the same windows had the system at `point` been the robot, its sensors' noise of `deviation`.
-
-    Also the control steps that were simulated.
-    """
+) -> Float[np.ndarray, "1 windows readings channels"]:
+    """Residuals of the same windows had the system at `point` been the robot, its sensors' noise of `deviation`."""
     key, readings = jax.random.fold_in(bench.key, 2), replays.readings
     noise = np.asarray(jax.random.normal(key, residuals.shape), np.float64) * deviation
     simulated = np.where(np.isfinite(residuals), residuals, 0.0) + noise
@@ -95,8 +89,8 @@ def _with_noise_alone(
 
 def _nearby_best(
     replays: FittedReplays, point: Float[np.ndarray, " d"], states: Float[np.ndarray, "windows state"]
-) -> tuple[Float[np.ndarray, "points d"], int]:
-    """The last points of Gauss-Newton steps from an estimate on whole windows of the hold-out, and their control steps.
+) -> Float[np.ndarray, "points d"]:
+    """The last points of Gauss-Newton steps from an estimate on whole windows of the hold-out.
 
     Initial states, which begin at those given, are unknowns too. These points have been fitted to the hold-out itself,
     so none is an estimate: they show what parameters could reach.
@@ -118,9 +112,7 @@ def _nearby_best(
         states = states + readings.in_state_units(eliminated.states_step(step), states.shape[1])
         point = point + step
         visited.append(point)
-    columns = 1 + 2 * len(point) + len(readings.spread)
-    spent = min(len(visited) + 1, NEARBY_STEPS, replays.most_steps) * columns * len(readings) * readings.steps
-    return np.array(visited[-_CANDIDATES:] or [point]), spent
+    return np.array(visited[-_CANDIDATES:] or [point])
 
 
 def _against_chance(replays: FittedReplays, residuals: Float[np.ndarray, "windows readings channels"]) -> AgainstChance:

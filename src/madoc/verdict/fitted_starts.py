@@ -74,14 +74,12 @@ class FittedReplays:
 
     def residuals(
         self, points: Float[np.ndarray, "systems d"], near: Float[np.ndarray, "windows state"] | None = None
-    ) -> tuple[Float[np.ndarray, "systems windows readings channels"], int]:
-        """Simulated minus measured observations of whole windows, and the control steps that were simulated.
+    ) -> Float[np.ndarray, "systems windows readings channels"]:
+        """Simulated minus measured observations of whole windows.
 
         They are in typical changes of a stride; NaN in a window whose simulation failed. Initial states are `starts`.
         """
-        states, spent = self.starts(points, near)
-        spent += len(points) * len(self.readings) * self.readings.steps
-        return self.residuals_from(points, states), spent
+        return self.residuals_from(points, self.starts(points, near))
 
     def residuals_from(
         self, points: Float[np.ndarray, "systems d"], states: Float[np.ndarray, "systems windows state"]
@@ -92,31 +90,26 @@ class FittedReplays:
 
     def starts(
         self, points: Float[np.ndarray, "systems d"], near: Float[np.ndarray, "windows state"] | None = None
-    ) -> tuple[Float[np.ndarray, "systems windows state"], int]:
+    ) -> Float[np.ndarray, "systems windows state"]:
         """The initial states from which each system comes nearest to the observations of the fitted steps.
 
         They are looked for around what an ensemble finds likely, or around those of a system that hardly differs, where
         these are given as `near`: unless steps were too few to find them, so that none has more steps than another.
-        Also the control steps that were simulated.
         """
         whole = self.readings
         first = replace(whole, actions=whole.actions[:, : self.fitted], observed=whole.observed[:, : self.fitted + 1])
         if near is None or self.most_steps < FIT_STEPS:
             log = self.held, self.logged, self.simulator, first, self.rows
-            likely, spent = likely_states(*log, points, self.near)
+            likely = likely_states(*log, points, self.near)
         else:
-            likely, spent = np.repeat(near[None], len(points), axis=0), 0
-        found = [self._fitted(first, point, states) for point, states in zip(points, likely, strict=True)]
-        return np.stack([states for states, _ in found]), spent + sum(steps for _, steps in found)
+            likely = np.repeat(near[None], len(points), axis=0)
+        return np.stack([self._fitted(first, *each) for each in zip(points, likely, strict=True)])
 
     def _fitted(
         self, first: Readings, point: Float[np.ndarray, " d"], states: Float[np.ndarray, "windows state"]
-    ) -> tuple[Float[np.ndarray, "windows state"], int]:
-        """States from which one system comes nearest to the first readings: each step moves those the last gained on.
-
-        Also the control steps that were simulated.
-        """
-        states, gaining, spent = states.copy(), np.arange(len(first)), 0
+    ) -> Float[np.ndarray, "windows state"]:
+        """States from which a system comes nearest to the first readings: each step moves those the last gained on."""
+        states, gaining = states.copy(), np.arange(len(first))
         for _ in range(self.most_steps):
             part, around = first.of(gaining), states[gaining]
             (slopes,) = slopes_at(self.simulator, part, point[None], around[None], parameters=False)
@@ -125,7 +118,6 @@ class FittedReplays:
             step = first.in_state_units(moved * ~self.logged.in_plane, states.shape[1])
             tried = around + _SHARES[:, None, None] * step
             residuals = part.residuals(self.simulator, point[None], tried.reshape(1, -1, states.shape[1]))[0]
-            spent += len(part) * first.steps * (1 + len(first.spread) + len(_SHARES))
             before = np.where(slopes.whole, (slopes.residuals**2).sum(-1), np.inf)
             costs = np.concatenate([_squares(residuals), before[None]])
             best = costs.argmin(0)
@@ -133,7 +125,7 @@ class FittedReplays:
             gaining = gaining[costs.min(0) < (1.0 - GAIN) * before]
             if len(gaining) <= FEW * len(first):
                 break
-        return states, spent
+        return states
 
 
 def replay_steps(logged: LoggedStates, stride: int, parameters: int) -> int:

@@ -172,7 +172,7 @@ def _from_logged(
         return residuals, rows
     observation, episodes = np.asarray(held.transitions.observation)[rows], held.episode_of(rows)
     replays = Replays(bench.simulator, windows, observation, rows, episodes, (steps,), bench.change)
-    chance, _ = by_chance(bench, replays, point, replays.noise_floor(held, point, noise))
+    chance = by_chance(bench, replays, point, replays.noise_floor(held, point, noise))
     drawn = replays.residuals(_drawn(point, covariance))
     of_parameters = drawn[np.arange(len(rows)) % IMITATED, np.arange(len(rows))] - residuals[-1]
     of_parameters = np.where(np.isfinite(of_parameters), of_parameters, 0.0)
@@ -198,7 +198,7 @@ def _from_fitted(
         if replays is None:
             return None
         replays = replace(replays, most_steps=most_steps)
-        states, _ = replays.starts(points)
+        states = replays.starts(points)
         parts = [replays.residuals_from(points, states)]
         if simulator is bench.simulator and covariance is not None:
             parts.append(_imitated(bench, replays, point, covariance, states[-1], parts[0][-1]))
@@ -227,7 +227,7 @@ def _imitated(
     noise = residual_noise(residuals[:, : replays.fitted + 1], made.shape[-1])
     made = np.where(np.isfinite(made), made, 0.0) + noise * random.standard_normal(made.shape)
     observed = moved(bench.simulator.task.attitudes, readings.observed, made * readings.scale)
-    return replace(replays, readings=replace(readings, observed=observed)).residuals(point[None])[0]
+    return replace(replays, readings=replace(readings, observed=observed)).residuals(point[None])
 
 
 def _drawn(point: Float[np.ndarray, " d"], covariance: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "systems d"]:

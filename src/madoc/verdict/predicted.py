@@ -40,9 +40,9 @@ def predicted(bench: Bench, point: Float[np.ndarray, " d"], interval: Float[np.n
     found = _replayed(bench, point)
     best, single = found.best, found.single
     systems = {"the simulator at mid-range": np.zeros(len(point)), "the simulator at the best parameters nearby": best}
-    lasting, rows = _persistence(bench, best)
-    at_end, refitting = _explained_at_end(bench, best, found.at_best, point, interval)
-    beside, of_chance = _beside_random(bench, found)
+    lasting = _persistence(bench, best)
+    at_end = _explained_at_end(bench, best, found.at_best, point, interval)
+    beside = _beside_random(bench, found)
     record = partial(
         Predicted,
         errors=found.errors,
@@ -61,7 +61,6 @@ def predicted(bench: Bench, point: Float[np.ndarray, " d"], interval: Float[np.n
         by_model=tuple(bench.against_chance(name, _simulated(bench, system)) for name, system in systems.items()),
         noise=single.noise,
         exact=True,
-        control_steps=found.control_steps + rows + refitting + of_chance,
     )
 
 
@@ -116,13 +115,11 @@ class _Replayed(NamedTuple):
     at_best: Float[np.ndarray, "windows steps observation"]
     noisy: Float[np.ndarray, "windows steps observation"]
     single: "_SingleSteps"
-    control_steps: int
 
 
 def _replayed(bench: Bench, point: Float[np.ndarray, " d"]) -> _Replayed:
     replays = bench.replays
-    nearby, searching = nearby_best(replays, point)
-    points = np.concatenate([np.zeros((1, len(point))), point[None], nearby])
+    points = np.concatenate([np.zeros((1, len(point))), point[None], nearby_best(replays, point)])
     residuals = replays.residuals(points)
     sizes = replays.magnitudes(residuals)
     best = best_of(sizes)
@@ -140,17 +137,16 @@ def _replayed(bench: Bench, point: Float[np.ndarray, " d"]) -> _Replayed:
         failed=int((~np.isfinite(residuals[1]).all((1, 2))).sum()),
         stride=stride(bench.problem.dataset),
     )
-    spent = searching + residuals[..., 0].size + noisy[..., 0].size * 2 + single.control_steps
-    return _Replayed(errors, points[best], residuals[best], noisy[0], single, spent)
+    return _Replayed(errors, points[best], residuals[best], noisy[0], single)
 
 
-def _beside_random(bench: Bench, found: _Replayed) -> tuple[Float[np.ndarray, " observation"], int]:
-    """The errors of each signal after the longest horizon over those of chance, and the control steps simulated."""
+def _beside_random(bench: Bench, found: _Replayed) -> Float[np.ndarray, " observation"]:
+    """The errors of each signal after the longest horizon over those of chance."""
     replays = bench.replays
-    random, rows = by_chance(bench, replays, found.best, found.noisy[None])
+    random = by_chance(bench, replays, found.best, found.noisy[None])
     left, chance = (replays.magnitudes(each)[:, 0, -1] for each in (found.at_best[None], random))
     groups = independent_groups(replays.episodes, replays.rows, replays.windows.steps)
-    return beside_random(left, chance, groups), rows + 2 * random[..., 0].size
+    return beside_random(left, chance, groups)
 
 
 def by_chance(
@@ -158,19 +154,16 @@ def by_chance(
     replays: Replays,
     point: Float[np.ndarray, " d"],
     noisy: Float[np.ndarray, "1 windows steps observation"],
-) -> tuple[Float[np.ndarray, "1 windows steps observation"], int]:
-    """Residuals of windows that sensor noise, which makes `noisy` ones, and random forces would cause together.
-
-    Also the control steps simulated to tell how large these are.
-    """
-    pushes, rows = _pushes(bench, replays, point, np.nan_to_num(np.nanmean(noisy[0, :, 0] ** 2, axis=0)))
-    return replays.random_floor(point, noisy, pushes), rows
+) -> Float[np.ndarray, "1 windows steps observation"]:
+    """Residuals of windows that sensor noise, which makes `noisy` ones, and random forces would cause together."""
+    pushes = _pushes(bench, replays, point, np.nan_to_num(np.nanmean(noisy[0, :, 0] ** 2, axis=0)))
+    return replays.random_floor(point, noisy, pushes)
 
 
 def _pushes(
     bench: Bench, replays: Replays, point: Float[np.ndarray, " d"], by_noise: Float[np.ndarray, " observation"]
-) -> tuple[Float[np.ndarray, "windows steps observation"], int]:
-    """What random forces may have changed in each row of the windows, and the control steps simulated.
+) -> Float[np.ndarray, "windows steps observation"]:
+    """What random forces may have changed in each row of the windows.
 
     That is the row's residual, less the share of all their mean square that sensor noise makes (`by_noise`). Rows whose
     state cannot be rebuilt have the residual of another one.
@@ -180,7 +173,7 @@ def _pushes(
     residuals = np.nan_to_num(_residuals(bench, point, rows))
     square = np.maximum((residuals**2).mean(0), np.finfo(float).tiny)
     share = np.sqrt(np.maximum(1.0 - by_noise / square, 0.0)) * (square > NEGLIGIBLE**2)
-    return (residuals * share)[np.minimum(np.searchsorted(rows, wanted), len(rows) - 1)], len(rows)
+    return (residuals * share)[np.minimum(np.searchsorted(rows, wanted), len(rows) - 1)]
 
 
 def _explained_at_end(
@@ -189,8 +182,8 @@ def _explained_at_end(
     residuals: Float[np.ndarray, "windows steps observation"],
     point: Float[np.ndarray, " d"],
     interval: Float[np.ndarray, "d 2"] | None,
-) -> tuple[float, int]:
-    """The share of the last residuals of windows that their start and actions explain, and the control steps spent.
+) -> float:
+    """The share of the last residuals of windows that their start and actions explain.
 
     Over a whole window an error of a parameter adds up, and that of the estimate is no sign of another model: where
     parameters fitted to whole windows are within the error of both fits of the estimate at `point`, the smaller share
@@ -201,18 +194,18 @@ def _explained_at_end(
     inputs = np.concatenate([replays.observation, actions], axis=1)
     share = explained_at_end(inputs, residuals, replays.rows)
     if share <= EXPLAINED or interval is None:
-        return share, 0
-    _, visited, spent = descend(
+        return share
+    _, visited = descend(
         replays.simulator, replays.windows, best, replays.scale, steps=WHOLE_STEPS, loss="cauchy", damping=DAMPING
     )
     if not len(visited):
-        return share, spent
+        return share
     half_width = np.abs(space.to_unit(interval.T) - point).max(0)
     of_both = half_width * np.sqrt(1.0 + len(bench.problem.dataset) / len(bench.held_out))
     if (np.abs(visited[-1] - point) > of_both).any():
-        return share, spent
+        return share
     refitted = replays.residuals(visited[-1:])[0]
-    return min(share, explained_at_end(inputs, refitted, replays.rows)), spent + refitted[..., 0].size
+    return min(share, explained_at_end(inputs, refitted, replays.rows))
 
 
 def sensor_noise(bench: Bench) -> Float[np.ndarray, " observation"]:
@@ -223,7 +216,7 @@ def sensor_noise(bench: Bench) -> Float[np.ndarray, " observation"]:
     if not bench.states_known:
         return bench.problem.noise_by_differences
     mid_range = np.zeros((1, len(bench.simulator.parameters)))
-    points = np.concatenate([mid_range, nearby_best(bench.replays, mid_range[0])[0]])
+    points = np.concatenate([mid_range, nearby_best(bench.replays, mid_range[0])])
     sizes = bench.replays.magnitudes(bench.replays.residuals(points)).mean((0, -1))
     best = points[int(np.argmin(relative_to_first(sizes)))]
     return _single_steps(bench, best).noise * bench.change
@@ -236,7 +229,6 @@ class _SingleSteps(NamedTuple):
     explained: float
     autocorrelation: float
     noise: Float[np.ndarray, " observation"]
-    control_steps: int
 
 
 def _single_steps(bench: Bench, point: Float[np.ndarray, " d"]) -> _SingleSteps:
@@ -244,25 +236,24 @@ def _single_steps(bench: Bench, point: Float[np.ndarray, " d"]) -> _SingleSteps:
     residuals = sensors.clipped(_residuals(bench, point, rows))
     first = np.flatnonzero((np.diff(rows) == 1) & ~np.isin(rows[1:], held.episode_starts))
     share, explanation = explained(bench.scaling.features(held.transitions.take(rows))[0], residuals)
-    noise, spent = np.zeros(len(scale)), len(rows)
+    noise = np.zeros(len(scale))
     if len(first):
         slopes = sensors.own_slopes(bench.simulator, held, point, rows[first], scale)
         unexplained = residuals - explanation
         # Both are lower bounds: what is explained of a channel at rest is its own noise in the reading before.
         parts = (sensors.consecutive_noise(part[first], part[first + 1], slopes) for part in (unexplained, residuals))
         noise = np.maximum(*parts)
-        spent += len(first) * (1 + len(scale))
     together = autocorrelation(residuals[first], residuals[first + 1])
-    return _SingleSteps(np.sqrt((residuals**2).mean(0)), share, together, noise, spent)
+    return _SingleSteps(np.sqrt((residuals**2).mean(0)), share, together, noise)
 
 
-def _persistence(bench: Bench, point: Float[np.ndarray, " d"]) -> tuple[float, int]:
-    """How residuals of single steps last, over the first rows whose states can be rebuilt, and their number."""
+def _persistence(bench: Bench, point: Float[np.ndarray, " d"]) -> float:
+    """How residuals of single steps last, over the first rows whose states can be rebuilt."""
     held = bench.held_out
     rows = logged_states(held, bench.simulator.task)[1][:MOST_ROWS]
     residuals = sensors.clipped(_residuals(bench, point, rows))
     follows = np.concatenate([[False], (np.diff(rows) == 1) & ~np.isin(rows[1:], held.episode_starts)])
-    return persistence(residuals, follows), len(rows)
+    return persistence(residuals, follows)
 
 
 def _residuals(

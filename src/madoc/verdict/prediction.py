@@ -153,12 +153,12 @@ def replays_of(
     )
 
 
-def nearby_best(replays: Replays, point: Float[np.ndarray, " d"]) -> tuple[Float[np.ndarray, "points d"], int]:
-    """The last points of Gauss-Newton steps from an estimate on single steps of the hold-out, and their control steps.
+def nearby_best(replays: Replays, point: Float[np.ndarray, " d"]) -> Float[np.ndarray, "points d"]:
+    """The last points of Gauss-Newton steps from an estimate on single steps of the hold-out.
 
     These points have been fitted to the hold-out itself, so none is an estimate: they show what parameters could reach.
     """
-    _, visited, spent = descend(
+    _, visited = descend(
         replays.simulator,
         replays.single_steps(),
         point,
@@ -168,4 +168,4 @@ def nearby_best(replays: Replays, point: Float[np.ndarray, " d"]) -> tuple[Float
         damping=DAMPING,
         shortest=_STILL,
     )
-    return visited[-_CANDIDATES:], spent
+    return visited[-_CANDIDATES:]

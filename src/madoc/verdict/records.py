@@ -123,7 +123,6 @@ def judged(
     residual: Float[np.ndarray, " channels"],
     by_model: tuple[AgainstChance, ...],
     noise: Float[np.ndarray, " channels"],
-    control_steps: int,
     exact: bool = False,
 ) -> Measure:
     """Complete a measure's record by the fields that all measures have.
@@ -133,15 +132,15 @@ def judged(
     in typical changes of a stride.
     """
     space, problem = bench.simulator.parameters, bench.problem
-    best, of_widths = _best_half_widths(bench, at, residual, noise if exact and noise.any() else None, exact=exact)
+    best = _best_half_widths(bench, at, residual, noise if exact and noise.any() else None, exact=exact)
     own = best
     if interval is not None:  # to the farther end, as the other may be cut off at an end of the range
         own = np.maximum(np.abs(space.to_unit(interval.T) - point).max(0), 1e-9)
     doubts, finer = _doubts(bench, point, own)
-    contradicting, of_columns = _contradictions(bench, point, at, doubts)
-    coarse, of_steps = 0.0, 0
+    contradicting = _contradictions(bench, point, at, doubts)
+    coarse = 0.0
     if bench.simulator.task.source is not None and bench.begins("the length of the timestep"):
-        coarse, of_steps = coarseness(problem.dataset, bench.states, problem.simulator, point, bench.change)
+        coarse = coarseness(problem.dataset, bench.states, problem.simulator, point, bench.change)
     ends = point[:, None] + np.outer(own, (-1.0, 1.0)) if interval is None else space.to_unit(interval.T).T
     widths = space, point[:, None] + np.outer(best, (-1.0, 1.0)), ends, own
     shares = _shares(*widths, doubts.alternatives)
@@ -156,7 +155,6 @@ def judged(
         interval_shares=of_range,
         against_chance=(*by_model, *bench.model_free),
         noise=dict(zip(signals, (noise * bench.change[: len(noise)]).tolist(), strict=True)),
-        control_steps=control_steps + of_widths + of_columns + of_steps + doubts.control_steps,
         missing_terms=_worth_keeping(doubts.terms),
         alternatives=doubts.alternatives,
         imitated=doubts.imitated,
@@ -178,19 +176,18 @@ def judged(
     late = next((each for each in contradicting if each.late), None)
     term = missing_term(found) if late is None else _delay(doubts, late)
     tested = partial(_richer, bench, point, own, doubts=doubts, finer=finer, shorter=shorter)
-    richer, of_richer = tested(term)
+    richer = tested(term)
     with_lag = None
     if term is not None and richer is not None and richer.left and term.parameter.startswith(_DELAYED):
         lag = replace(term, cause=LAG, parameter=term.parameter.replace(_DELAYED, "action_lag", 1))
-        with_lag, more = tested(lag)
-        of_richer += more
+        with_lag = tested(lag)
         if with_lag is not None and not with_lag.left:
             same = (term.cause, term.parameter)
             terms = tuple(lag if (each.cause, each.parameter) == same else each for each in found.missing_terms)
             found, term, richer = replace(found, missing_terms=terms), lag, with_lag
     tried = [name for name, model in (("constant delay", richer), ("lag of first order", with_lag)) if model]
     told = tuple(_contradiction(each, term, richer, tried) for each in contradicting)
-    return replace(found, richer=richer, contradictions=told, control_steps=found.control_steps + of_richer)
+    return replace(found, richer=richer, contradictions=told)
 
 
 def _worth_keeping(terms: Sequence[MissingTerm]) -> tuple[MissingTerm, ...]:
@@ -207,8 +204,6 @@ def _told_apart(found: Measure, doubts: Suspicions, *, finer: bool) -> Measure:
     step = [term for term in found.missing_terms if term.cause == INTEGRATION]
     others = [term for term in _worth_keeping(doubts.terms) if term.cause != INTEGRATION]
     terms = tuple(sorted((*step, *others), key=lambda term: -abs(term.t)))
-    spent = found.control_steps + doubts.control_steps
-    found = replace(found, control_steps=spent)
     return replace(found, missing_terms=terms, finer=finer) if doubts.tested else found
 
 
@@ -234,13 +229,13 @@ def _richer(
     doubts: Suspicions,
     finer: bool,
     shorter: int,
-) -> tuple[RicherModel | None, int]:
-    """The model with a term, if a parameter of a spec adds it and there is time; also the control steps simulated."""
+) -> RicherModel | None:
+    """The model with a term, if a parameter of a spec adds it and there is time to test it."""
     if term is None or not is_of_spec(term) or not doubts.tested:
-        return None, 0
+        return None
     seconds = doubts.control_steps / bench.rate
     if not bench.begins(f"the model with {term.parameter}", BEFORE_OTHERS * seconds):
-        return None, 0
+        return None
     given = bench.problem.dataset, bench.states, bench.simulator, point, half_widths, bench.change, term
     return richer_model(*given, finer=finer, most=_windows_in_time(bench), shorter=shorter)
 
@@ -262,40 +257,40 @@ def _best_half_widths(
     sensors: Float[np.ndarray, " channels"] | None,
     *,
     exact: bool,
-) -> tuple[Float[np.ndarray, " d"], int]:
-    """Half of the narrowest 95 % intervals that the log allows, in [-1, 1], and the control steps simulated.
+) -> Float[np.ndarray, " d"]:
+    """Half of the narrowest 95 % intervals that the log allows, in [-1, 1].
 
     Where states are exact but for the noise of `sensors`, windows with fitted initial states may tell more than single
     noisy steps do.
     """
     given = bench.problem.states, bench.problem.dataset, bench.problem.simulator, at
     residual = np.maximum(residual, NEGLIGIBLE) * bench.change[: len(residual)]
-    half, spent = expected_half_widths(*given, residual, exact=exact)
+    half = expected_half_widths(*given, residual, exact=exact)
     if sensors is None:
-        return half, spent
-    fitted, more = expected_half_widths(*given, np.maximum(sensors, NEGLIGIBLE) * bench.change, exact=False)
-    return np.minimum(half, fitted), spent + more
+        return half
+    fitted = expected_half_widths(*given, np.maximum(sensors, NEGLIGIBLE) * bench.change, exact=False)
+    return np.minimum(half, fitted)
 
 
 def _contradictions(
     bench: Bench, point: Float[np.ndarray, " d"], at: Float[np.ndarray, " d"], doubts: Suspicions
-) -> tuple[tuple[Finding, ...], int]:
-    """Findings of the log that contradict the spec, and the control steps simulated.
+) -> tuple[Finding, ...]:
+    """Findings of the log that contradict the spec.
 
     Actions that seem late are none where tests at the estimate exclude it. Sizes that the log alone tells roughly are
     findings only where errors are far beyond noise and nothing else explains them, which is seen later.
     """
     simulator, dataset = bench.simulator, bench.problem.dataset
-    found, spent = dataset.findings, 0
+    found = dataset.findings
     possible = simulator.task.state_from_observation is not None and bench.held_out.disturbance.shuffled == "none"
     if possible and bench.begins(EXCHANGED):
         points = np.stack([np.zeros(len(point)), point, at])
-        exchanged, spent = exchanged_columns(
+        exchanged = exchanged_columns(
             bench.held_out, simulator, points, horizons(dataset)[1], bench.change, contradicts=True
         )
         found = (*exchanged, *found)
     in_time = actions_in_time(doubts.terms, simulator.control_step)
-    return tuple(each for each in found if each.contradicts and not (each.late and in_time)), spent
+    return tuple(each for each in found if each.contradicts and not (each.late and in_time))
 
 
 def _shares(

@@ -37,8 +37,8 @@ def richer_model(
     finer: bool,
     most: int | None,
     shorter: int,
-) -> tuple[RicherModel | None, int]:
-    """The model with the parameter of a term, or None if it cannot be tested; also the control steps simulated.
+) -> RicherModel | None:
+    """The model with the parameter of a term, or None if it cannot be tested.
 
     Args:
         dataset: The log that was calibrated to.
@@ -69,5 +69,4 @@ def richer_model(
     found = suspicions(dataset, logged, wide, at, widths, scale, of_other_model=True, most=most, shorter=shorter)
     left = [each for each in found.terms if each.cause != INTEGRATION and abs(each.t) >= LIKELY_FORCE]
     more = (f"something that lasts over several rows (correlation {found.alike:.2f})",) if found.alike > WHITE else ()
-    steps = found.control_steps * (FINER if finer else 1)
-    return RicherModel(term.parameter, (*map(named, left), *more)) if found.tested else None, steps
+    return RicherModel(term.parameter, (*map(named, left), *more)) if found.tested else None

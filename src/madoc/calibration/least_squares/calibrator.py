@@ -39,6 +39,7 @@ from madoc.errors import MadocError
 from madoc.identification.information import identifiability, quantile, sandwich
 from madoc.identification.losses import Loss
 from madoc.identification.noise import NOISY, alternation
+from madoc.simulation.base import SIMULATED
 from madoc.types import Count, Epoch, NotNegative, check_hyperparameters, named_key
 
 InitialStates = Literal["logged", "estimated"]
@@ -118,46 +119,37 @@ class LeastSquares:
 
     def step(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[LeastSquaresState, Epoch]:
         """Take one damped step of the current search, and decide which search goes on."""
+        began = SIMULATED.control_steps
         if state.prediction is not None and state.prediction.progress == "under way":
             prediction, epoch = predicting.step(problem, state.prediction)
             state = replace(state, prediction=prediction, finished=int(prediction.progress != "under way"))
         elif state.stage == "filtering":
             assert state.filtered is not None
             by_filter, epoch = filtering.step(problem, state.filtered, self.loss)
-            state, spent = after_filter(problem, replace(state, filtered=by_filter), self._unknown(problem).horizon)
-            epoch = replace(epoch, control_steps=epoch.control_steps + spent)
+            state = after_filter(problem, replace(state, filtered=by_filter), self._unknown(problem).horizon)
         elif state.estimates_starts:
             search, epoch = self._unknown(problem, state.length).step(problem, state.unknown[state.length])
             if state.filtered is not None and not leaves_much_less(search, state.filtered):
                 state = back_to_filter(with_search(state, 0, search))
             else:
-                state = self._after_unknown(problem, with_search(state, state.length, search))
-                state, epoch = self._then_predicting(problem, state, epoch)
+                state = self._then_predicting(
+                    problem, self._after_unknown(problem, with_search(state, state.length, search))
+                )
         else:
             assert state.known is not None
             search, epoch = self._known(problem).step(problem, state.known)
-            state, asking = self._after_known(problem, replace(state, known=search))
-            epoch = replace(epoch, control_steps=epoch.control_steps + asking)
-            state, epoch = self._then_predicting(problem, state, epoch)
-        if not state.finished:
-            return state, epoch
-        return state, replace(epoch, converged="another iteration would hardly change any estimate")
+            state = self._then_predicting(problem, self._after_known(problem, replace(state, known=search)))
+        converged = "another iteration would hardly change any estimate" if state.finished else None
+        return state, replace(epoch, control_steps=SIMULATED.control_steps - began, converged=converged)
 
-    def _then_predicting(
-        self, problem: CalibrationProblem, state: LeastSquaresState, epoch: Epoch
-    ) -> tuple[LeastSquaresState, Epoch]:
+    def _then_predicting(self, problem: CalibrationProblem, state: LeastSquaresState) -> LeastSquaresState:
         """Begin the fit for prediction once the searches have ended, if they left more than noise."""
         prediction = state.prediction
-        if not state.finished or prediction is None:
-            return state, epoch
-        more, asking = self._leaves_more_than_noise(problem, state)
-        epoch = replace(epoch, control_steps=epoch.control_steps + asking)
-        if not more:
-            return state, epoch
+        if not state.finished or prediction is None or not self._leaves_more_than_noise(problem, state):
+            return state
         horizon = self._unknown(problem).horizon if state.estimates_starts else 0
-        prediction, spent = predicting.begun(problem, prediction, self._fitted(state).point[0], horizon)
-        state = replace(state, prediction=prediction, finished=int(prediction.progress != "under way"))
-        return state, replace(epoch, control_steps=epoch.control_steps + spent)
+        prediction = predicting.begun(problem, prediction, self._fitted(state).point[0], horizon)
+        return replace(state, prediction=prediction, finished=int(prediction.progress != "under way"))
 
     def _fitted(self, state: LeastSquaresState) -> SearchState:
         """The search with windows of fitted or known states that has the estimate, but for one that predicts better."""
@@ -292,23 +284,23 @@ class LeastSquares:
             searches.append(longer)
         return tuple(searches)
 
-    def _after_known(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[LeastSquaresState, int]:
-        """Go on to unknown initial states where logged ones are noisy; also the control steps simulated to decide that.
+    def _after_known(self, problem: CalibrationProblem, state: LeastSquaresState) -> LeastSquaresState:
+        """Go on to unknown initial states where logged ones are noisy.
 
         That is decided once the search refines and, as model errors may hide noise, again once it has settled.
         """
-        known, asking = state.known, 0
+        known = state.known
         assert known is not None
         settled = self._known(problem).settled(known)
         if state.stage == "starting" and known.refining:
-            return begun(state, known), asking
+            return begun(state, known)
         if state.stage == "undecided" and (settled or (known.refining and not known.epochs)):
             if np.sqrt(known.cost[0]) >= EXACT:
-                pairs, asking = consecutive_residuals(problem, known.point[0], known.rows)
+                pairs = consecutive_residuals(problem, known.point[0], known.rows)
                 if alternation(*pairs) > NOISY:
-                    return begun(state, known), asking
+                    return begun(state, known)
             state = replace(state, stage="logged" if settled else "undecided")
-        return replace(state, finished=int(settled and state.stage == "logged")), asking
+        return replace(state, finished=int(settled and state.stage == "logged"))
 
     def _after_unknown(self, problem: CalibrationProblem, state: LeastSquaresState) -> LeastSquaresState:
         """Go on to longer windows once a search has settled, while they narrow the intervals.
@@ -346,8 +338,8 @@ class LeastSquares:
         readings = self._unknown(problem, length).horizon + 1
         return noise_alone(state.unknown[length], state.unknown[0], readings)
 
-    def _leaves_more_than_noise(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[bool, int]:
-        """Whether the model may lack something, so that another estimate may predict better; also control steps.
+    def _leaves_more_than_noise(self, problem: CalibrationProblem, state: LeastSquaresState) -> bool:
+        """Whether the model may lack something, so that another estimate may predict better.
 
         From logged states, which have no noise, that is residuals that are alike in consecutive rows, as those of
         random forces are not; from estimated ones long tails of the residuals, or more than noise on longer windows,
@@ -356,12 +348,12 @@ class LeastSquares:
         best = self._fitted(state)
         if not state.estimates_starts:
             if float(np.sqrt(best.cost[0])) < EXACT:
-                return False, 0
-            (before, after), asking = consecutive_residuals(problem, best.point[0], best.rows)
-            return alternation(before, -after) > 0.0, asking
+                return False
+            before, after = consecutive_residuals(problem, best.point[0], best.rows)
+            return alternation(before, -after) > 0.0
         tried = [length for length in range(LONGER, len(state.unknown)) if state.unknown[length].epochs]
         noise = all(self._noise_alone(problem, state, length) for length in tried)
-        return not noise or sentences.have_long_tails(problem, best), 0
+        return not noise or sentences.have_long_tails(problem, best)
 
     def _with_model_errors(self, problem: CalibrationProblem, state: LeastSquaresState) -> int | None:
         """Index of the first longer windows, none shorter than the estimate's, that leave more than noise, or None."""

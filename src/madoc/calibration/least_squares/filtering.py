@@ -311,7 +311,7 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
             fewer = problem.dataset, problem.states, problem.simulator, readings.of(some), rows[some]
             found, noise = with_noise(*fewer, state.point, state.noise, rounding, LARGE, LARGE_ROUNDS, random[2])
             following = replace(following, noise=noise, cost=_cost(found, loss), alike=found.alike())
-        return following, Epoch({"moved": state.moved}, epoch_steps(problem, state))
+        return following, Epoch({"moved": state.moved})
     together = state.together + 1 if state.near else 0
     gradients, products, squares = (
         _counted(kept if together > 1 else np.zeros_like(kept), each, block, 1 + max(0, together - 1) // state.blocks)
@@ -352,7 +352,7 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
         failures=state.failures + int((~whole).sum()),
     )
     metrics = {"residual": following.cost**0.5, "moved": following.moved, "noise": float(np.median(noise))}
-    return following, Epoch(metrics, epoch_steps(problem, state))
+    return following, Epoch(metrics)
 
 
 def _cost(found: Innovations, loss: Loss) -> float:

@@ -115,8 +115,7 @@ class KnownStarts:
             before = mean_cost(plan.residuals, plan.scale, self.loss)
             totals = np.array([*(mean_cost(each, plan.scale, self.loss) for each in residuals), before])
             failures = int((~np.isfinite(residuals).all(-1)).sum())
-            simulations = residuals.shape[0] * residuals.shape[1]
-            outcomes.append(Outcome(before, totals, np.zeros((len(totals), 0)), failures, simulations))
+            outcomes.append(Outcome(before, totals, np.zeros((len(totals), 0)), failures))
         return outcomes
 
     def _plan(

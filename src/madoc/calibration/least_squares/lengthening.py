@@ -206,31 +206,28 @@ def begun(state: LeastSquaresState, known: SearchState) -> LeastSquaresState:
     return replace(with_search(state, 0, first), stage="estimated")
 
 
-def after_filter(problem: CalibrationProblem, state: LeastSquaresState, horizon: int) -> tuple[LeastSquaresState, int]:
+def after_filter(problem: CalibrationProblem, state: LeastSquaresState, horizon: int) -> LeastSquaresState:
     """The state after an epoch of the filter: at its end, or with fitted starts where it left what is unlike noise.
 
     What an ensemble leaves of data without noise is like what it leaves of the next reading. Where fitted starts of a
-    few windows of this horizon leave less, the search goes on with them to the exact values. Also the control steps
-    that it took to fit them.
+    few windows of this horizon leave less, the search goes on with them to the exact values.
     """
     filtered = state.filtered
     assert filtered is not None
     if not filtered.settled:
-        return state, 0
+        return state
     if not state.unknown or not filtered.found.unlike_noise:
-        return replace(state, finished=1), 0
+        return replace(state, finished=1)
     first, point, log = state.unknown[0], filtered.point, (problem.dataset, problem.states, problem.simulator)
     readings = Readings.at(problem.dataset, problem.states, first.rows, horizon, problem.typical_change)
-    (likely,), spent = likely_states(*log, readings, first.rows, point[None], first.states[0])
+    (likely,) = likely_states(*log, readings, first.rows, point[None], first.states[0])
     tried = settled(problem.simulator, readings, point, likely, (0.0, *RESETTLING), 0)
-    spent += tried.simulations * horizon
     whole = (tried.costs < FAILED_WINDOW).sum() >= FEWEST + len(point)
     if not whole or (tried.deviation > LESS * filtered.noise).any():
-        return replace(state, finished=1), spent
+        return replace(state, finished=1)
     found = settled_to_noise(problem.simulator, readings, point, likely)
-    spent += found.simulations * horizon
     first = replace(first, point=point[None].copy(), states=found.states[None], refining=1)
-    return replace(state, unknown=(first,), stage="estimated"), spent
+    return replace(state, unknown=(first,), stage="estimated")
 
 
 def leaves_much_less(search: SearchState, filtered: FilterState) -> bool:

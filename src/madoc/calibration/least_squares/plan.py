@@ -87,14 +87,12 @@ class Outcome:
         totals: Cost after each step that was tried; the last has no step of the parameters.
         followed: Share of its initial state's step that fits each window best, where initial states are unknown.
         failures: Number of simulations that failed.
-        simulations: Number of simulations of a window that it took.
     """
 
     before: float
     totals: Float[np.ndarray, " trials"]
     followed: Float[np.ndarray, "trials unknown"]
     failures: int
-    simulations: int
 
     def with_no_step(self) -> "Outcome":
         """The same with the cost of staying where the plan is, as the last step."""

@@ -136,26 +136,24 @@ def windows_for(problem: CalibrationProblem) -> Prediction | None:
     )
 
 
-def begun(
-    problem: CalibrationProblem, state: Prediction, point: Float[np.ndarray, " d"], horizon: int
-) -> tuple[Prediction, int]:
-    """The fit at an estimate, and the control steps simulated to fit initial states to readings of `horizon` rows.
+def begun(problem: CalibrationProblem, state: Prediction, point: Float[np.ndarray, " d"], horizon: int) -> Prediction:
+    """The fit at an estimate, with initial states fitted to readings of `horizon` rows.
 
     With none, states are exact as logged. Windows whose readings no initial state explains, as where one of the first
     is false, begin anew, and are left out if that does not help. Where the log shows contacts the fit ends at once:
     from states with errors they begin and end at other times.
     """
     if touched(problem, *problem.states.guesses(), state.rows, steps_of_a_second(problem)).any():
-        return replace(state, progress="no better"), 0
+        return replace(state, progress="no better")
     at_estimate = replace(state, progress="under way", first=point, best=point, point=point)
     if not horizon:
-        return at_estimate, 0
+        return at_estimate
     horizon = min(horizon, steps_of_a_second(problem))
     readings = Readings.at(problem.dataset, problem.states, state.rows, horizon, problem.typical_change)
     after = settled(problem.simulator, readings, point, state.states, NARROW, ANEW)
     kept = after.costs <= UNLIKE_NOISE
     noise = float(np.sqrt((after.deviation**2).mean()))
-    return replace(at_estimate, states=after.states, kept=kept, noise=noise), after.simulations * horizon
+    return replace(at_estimate, states=after.states, kept=kept, noise=noise)
 
 
 def step(problem: CalibrationProblem, state: Prediction) -> tuple[Prediction, Epoch]:
@@ -167,10 +165,9 @@ def step(problem: CalibrationProblem, state: Prediction) -> tuple[Prediction, Ep
     around = difference_points(state.point)
     residuals = _residuals(problem, state, around)
     slopes, errors = linearise(around, residuals), _errors(residuals[0])
-    spent = (len(around) + len(TRIALS)) * int(state.kept.sum()) * steps_of_a_second(problem)
     noise_alone = not state.rounds and not state.epochs and float(errors.mean()) <= ABOVE_NOISE * state.noise
     if noise_alone or len(slopes.residuals) < len(errors) or len(errors) < FEWEST + len(state.point):
-        return replace(state, progress=_ended(state)), Epoch({}, spent, stage="predicting")
+        return replace(state, progress=_ended(state)), Epoch({}, stage="predicting")
     state = replace(state, error=state.error or float(errors.mean()))
     before = _cost(state, state.point, errors)
     steps = [_step(state, slopes, state.damping * factor) for factor in TRIALS]
@@ -188,10 +185,9 @@ def step(problem: CalibrationProblem, state: Prediction) -> tuple[Prediction, Ep
         epochs=state.epochs + 1,
     )
     if over:
-        state, more = _compared(problem, state)
-        spent += more
+        state = _compared(problem, state)
     metrics = {"residual": min(before, costs[best]), "moved": float(np.abs(steps[best]).max() * helps)}
-    return state, Epoch(metrics, spent, stage="predicting")
+    return state, Epoch(metrics, stage="predicting")
 
 
 def medians_of_three(
@@ -257,14 +253,14 @@ def _covariance(state: Prediction, slopes: Linearisation) -> Float[np.ndarray, "
     return inverse @ (scores.T @ scores) @ inverse
 
 
-def _compared(problem: CalibrationProblem, state: Prediction) -> tuple[Prediction, int]:
-    """The state once the point is compared with the best estimate so far, and the control steps simulated."""
-    better, spent = _is_better(problem, state)
+def _compared(problem: CalibrationProblem, state: Prediction) -> Prediction:
+    """The state once the point is compared with the best estimate so far."""
+    better = _is_better(problem, state)
     if better and state.rounds + 1 < ROUNDS:
         state = replace(state, error=0.0, damping=FIRST_DAMPING, epochs=0)
     else:
         state = replace(state, progress="better" if better else _ended(state))
-    return replace(state, best=state.point, rounds=state.rounds + 1) if better else state, spent
+    return replace(state, best=state.point, rounds=state.rounds + 1) if better else state
 
 
 def _ended(state: Prediction) -> Progress:
@@ -272,8 +268,8 @@ def _ended(state: Prediction) -> Progress:
     return "better" if state.rounds else "no better"
 
 
-def _is_better(problem: CalibrationProblem, state: Prediction) -> tuple[bool, int]:
-    """Whether the point predicts better than the best estimate so far, and the control steps simulated.
+def _is_better(problem: CalibrationProblem, state: Prediction) -> bool:
+    """Whether the point predicts better than the best estimate so far.
 
     Every stretch of the log is predicted by parameters that were fitted to the others: the point moved by what leaving
     the stretch out changes of a Gauss-Newton step. A point at an end of a range is none where the best one is inside: a
@@ -282,17 +278,16 @@ def _is_better(problem: CalibrationProblem, state: Prediction) -> tuple[bool, in
     space, around = problem.simulator.parameters, difference_points(state.point)
     outside = set(space.at_end(state.point)) - set(space.at_end(state.best))
     if outside or (state.point == state.best).all():
-        return False, 0
+        return False
     residuals = _residuals(problem, state, around)
     slopes = linearise(around, residuals)
     windows = len(slopes.residuals)
-    spent = (len(around) + FOLDS + 1) * int(state.kept.sum()) * steps_of_a_second(problem)
     if windows < residuals.shape[1]:
-        return False, spent
+        return False
     stretch, whole = np.arange(windows) * FOLDS // windows, _step(state, slopes, _LITTLE)
     without = [state.point + _step(state, slopes.of(stretch != each), _LITTLE) - whole for each in range(FOLDS)]
     errors = _errors(_residuals(problem, state, np.stack([*without, state.best]).clip(-1.0, 1.0)))
-    return predicts_better(errors[stretch, np.arange(windows)], errors[-1]), spent
+    return predicts_better(errors[stretch, np.arange(windows)], errors[-1])
 
 
 def predicts_better(found: Float[np.ndarray, " windows"], before: Float[np.ndarray, " windows"]) -> bool:

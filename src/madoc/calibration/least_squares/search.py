@@ -176,8 +176,7 @@ class Search:
         if not state.refining and (new["moved"][leader] < 1.0 or following.epochs >= self.search_epochs):
             following = self._refined(following, leader)
         stage = "calibrating" if state.refining else "searching"
-        spent = self._derivative_steps(problem, state) + self.horizon * sum(each.simulations for each in outcomes)
-        return following, Epoch(metrics, spent, stage=stage)
+        return following, Epoch(metrics, stage=stage)
 
     def _advanced(
         self, state: SearchState, plans: Sequence[Plan], outcomes: Sequence[Outcome], *, share: float
@@ -215,7 +214,7 @@ class Search:
         )
         noise = float(np.median(after.deviation))
         metrics = {"residual": float(np.sqrt(after.costs.mean())) * noise, "noise": noise}
-        return following, Epoch(metrics, after.simulations * self.horizon, stage="calibrating")
+        return following, Epoch(metrics, stage="calibrating")
 
     def settled(self, state: SearchState) -> bool:
         """Whether the last step on all windows was too small to matter; never while every window fails."""
@@ -240,17 +239,9 @@ class Search:
 
     def _epoch_steps(self, problem: CalibrationProblem, state: SearchState) -> int:
         """About how many control steps an epoch simulates."""
-        trials = 0 if state.waiting else self.starts.trial_columns(refining=bool(state.refining))
-        return self._derivative_steps(problem, state) + self._window_steps(state) * trials
-
-    def _derivative_steps(self, problem: CalibrationProblem, state: SearchState) -> int:
-        """Control steps of an epoch's derivatives."""
-        columns = (self.starts.settling_columns if state.waiting else self.starts.columns)(problem)
-        return self._window_steps(state) * columns
-
-    def _window_steps(self, state: SearchState) -> int:
-        """Control steps of all windows of all searches under one system each."""
-        return self._running(state) * self.window_count(state) * self.horizon
+        tried = self.starts.trial_columns(refining=bool(state.refining))
+        columns = self.starts.settling_columns(problem) if state.waiting else self.starts.columns(problem) + tried
+        return self._running(state) * self.window_count(state) * self.horizon * columns
 
     def _settles_roughly(self, state: SearchState) -> bool:
         """Whether steps of half a standard error are small enough: after many steps that were larger.

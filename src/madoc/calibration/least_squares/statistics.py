@@ -112,8 +112,8 @@ def autocorrelation(residuals: Float[np.ndarray, "windows readings channels"]) -
 
 def consecutive_residuals(
     problem: CalibrationProblem, point: Float[np.ndarray, " d"], rows: Int[np.ndarray, " windows"]
-) -> tuple[tuple[Residuals, Residuals], int]:
-    """One-step residuals from logged states and from those a row later, and the control steps simulated.
+) -> tuple[Residuals, Residuals]:
+    """One-step residuals from logged states and from those a row later.
 
     `point` are parameters in [-1, 1], `rows` have a logged state; those without one a row later are left out.
     """
@@ -125,7 +125,7 @@ def consecutive_residuals(
     residuals = window_residuals(problem.simulator, windows, point[None], problem.typical_change)[0]
     pairs = residuals.reshape(2, len(first), residuals.shape[-1])
     before, after = pairs[:, np.isfinite(pairs).all((0, 2))]
-    return (before, after), len(both)
+    return before, after
 
 
 def noisy_rows(problem: CalibrationProblem) -> bool:

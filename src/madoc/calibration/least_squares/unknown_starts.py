@@ -3,7 +3,7 @@
 Channels are weighted by their noise as estimated from the fit, and windows that no initial state explains are left out.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -143,15 +143,12 @@ class UnknownStarts:
         Where a search refines, the least damped step is tried first, with the whole steps of the states, and the others
         only if that does not help: where motion is smooth, the whole step mostly leads to the minimum.
         """
-        spent = 0
         if refining:
             alone = self._tried(plans, states, trials=1, shares=FOLLOWED[:1])
             helping = (plan.kept.any() and one.totals[0] < one.before for plan, one in zip(plans, alone, strict=True))
             if all(helping):
                 return [outcome.with_no_step() for outcome in alone]
-            spent = len(self.readings)
-        every = self._tried(plans, states, trials=len(TRIALS) + 1, shares=FOLLOWED)
-        return [replace(outcome, simulations=outcome.simulations + spent) for outcome in every]
+        return self._tried(plans, states, trials=len(TRIALS) + 1, shares=FOLLOWED)
 
     def _tried(
         self,
@@ -179,19 +176,19 @@ class UnknownStarts:
     def _outcome(
         self, plan: Plan, residuals: Float[np.ndarray, "trials ways windows values"], shares: tuple[float, ...]
     ) -> Outcome:
-        costs, simulations = window_costs(residuals, self.loss), int(np.prod(residuals.shape[:-1]))
+        costs = window_costs(residuals, self.loss)
         followed = np.array(shares)[costs.argmin(1)]
         if len(shares) == 1:  # a state whose step makes its window worse stays where it is
             worse = costs[:, 0] > np.maximum(window_costs(plan.residuals, self.loss), LIKE_NOISE)
             followed = np.where(worse, 0.0, followed)
         if not plan.kept.any():
-            return Outcome(FAILED_WINDOW, costs.min(1).mean(-1), followed, 0, simulations)
+            return Outcome(FAILED_WINDOW, costs.min(1).mean(-1), followed, 0)
         before, after = window_costs(plan.residuals, self.loss)[plan.kept], costs.min(1)[:, plan.kept]
         change = after - before
         if self.loss != "linear":
             activity = self.readings.activity[plan.kept]
             change = clipped_change(before, after, activity, least=LIKE_NOISE, failed=FAILED_WINDOW)
-        return Outcome(float(before.mean()), before.mean() + change.mean(-1), followed, 0, simulations)
+        return Outcome(float(before.mean()), before.mean() + change.mean(-1), followed, 0)
 
     def _plan(
         self,
