@@ -50,7 +50,7 @@ def result(**changes):
     deviation = np.array([row[1] for row in PARAMETERS.values()])
     correlation = np.eye(4)
     correlation[1, 2] = correlation[2, 1] = -0.9
-    errors = tuple(PredictionError(steps, at, (at / 2, at * 2), {}) for steps, at in ((1, 0.01), (5, 0.1)))
+    errors = tuple(PredictionError(steps, at, (at / 2, at * 2)) for steps, at in ((1, 0.01), (5, 0.1)))
     holdout = Predicted(
         split="1 of 5 episodes is held out",
         rows=1000,
@@ -65,7 +65,7 @@ def result(**changes):
             MissingTerm("a spring", "jnt_stiffness.hip", 1.0, 0.4, "N·m/rad", 0.01, 2.5, {"gravity": 0.5}),
         ),
         alternatives=(Alternative(("a spring (jnt_stiffness.hip)",), {"gravity": 0.5}, {"gravity": 0.4}),),
-        errors=PredictionErrors(errors, errors, errors, errors, 0.04, (0.03, 0.05), 0.04, 100, 0),
+        errors=PredictionErrors(errors, errors, errors, errors, 0.04, (0.03, 0.05), 0.04, 100),
         explained=0.0,
         autocorrelation=0.0,
     )

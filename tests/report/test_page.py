@@ -102,7 +102,7 @@ def test_a_hold_out_is_told_by_its_own_measure(whole):
         "area_at_mid_range": {"area": 0.9, "interval": [0.8, 0.95], "rows": 100},
         "area_at_estimate": {"area": 0.52, "interval": [0.45, 0.6], "rows": 100},
     }
-    hidden = common | errors | {"measure": "fitted", "fitted_steps": 10}
+    hidden = common | errors | {"measure": "fitted"}
     write_json(file, stored | {"holdout": hidden})
     held = content(whole, "holdout")
     assert len(held["facts"]) == 2 and "control steps ahead of a fitted start" in held["chart"]

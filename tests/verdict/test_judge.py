@@ -23,7 +23,7 @@ from madoc.verdict.judge import beats_mid_range, explains_all
 
 
 def errors(one, twenty):
-    return tuple(PredictionError(steps, mean, (mean, mean), {"q": mean}) for steps, mean in ((1, one), (20, twenty)))
+    return tuple(PredictionError(steps, mean, (mean, mean)) for steps, mean in ((1, one), (20, twenty)))
 
 
 COMMON = {
@@ -45,11 +45,10 @@ ERRORS = PredictionErrors(
     relative_interval=(0.08, 0.12),
     nearby_relative=0.09,
     windows=400,
-    failed_windows=0,
 )
 BEFORE, AFTER = Area(0.9, (0.87, 0.93), 400), Area(0.5, (0.46, 0.54), 400)
 PREDICTED = Predicted(**COMMON, errors=ERRORS, explained=0.02, autocorrelation=-0.5)
-FITTED = Fitted(**COMMON, errors=ERRORS, explained=0.02, fitted_steps=10)
+FITTED = Fitted(**COMMON, errors=ERRORS, explained=0.02)
 TOLD_APART = ToldApart(**COMMON, area_at_mid_range=BEFORE, area_at_estimate=AFTER)
 EITHER = pytest.mark.parametrize("good", [PREDICTED, FITTED])
 LEFT_OVER = {"nearby_best": errors(0.1, 0.8)}

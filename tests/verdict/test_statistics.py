@@ -75,12 +75,12 @@ def test_rows_of_their_own_are_exchanged_with_any():
 
 def test_noise_hides_the_gain_where_mid_range_errs_by_no_more_than_noise_does():
     def errors(*means):
-        return tuple(PredictionError(steps, mean, (mean, mean), {}) for steps, mean in zip((1, 20), means, strict=True))
+        return tuple(PredictionError(steps, mean, (mean, mean)) for steps, mean in zip((1, 20), means, strict=True))
 
     hidden = PredictionErrors(
         **{"mid_range": errors(0.12, 0.3), "estimate": errors(0.1, 0.3), "nearby_best": errors(0.1, 0.3)},
         **{"noise": errors(0.1, 0.2), "relative": 1.0, "relative_interval": (0.9, 1.1), "nearby_relative": 0.99},
-        **{"windows": 400, "failed_windows": 0},
+        windows=400,
     )
     assert hides_gain(hidden)
     assert not hides_gain(replace(hidden, nearby_relative=0.5))

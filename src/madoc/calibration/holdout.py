@@ -35,13 +35,11 @@ class PredictionError:
         steps: Horizon of the predictions in control steps.
         mean: Mean over windows and signals.
         interval: 95 % confidence interval of the mean, by resampling episodes, or stretches where these are few.
-        by_signal: Mean over windows, by signal.
     """
 
     steps: int
     mean: float
     interval: tuple[float, float]
-    by_signal: dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -57,7 +55,6 @@ class PredictionErrors:
         relative_interval: 95 % confidence interval of `relative`.
         nearby_relative: The same ratio for `nearby_best`, or for `noise` where that is larger.
         windows: Number of windows of the hold-out that were replayed.
-        failed_windows: How many of them failed in simulation at the estimate.
         stride: Number of control steps in which a signal typically changes by the errors' unit.
     """
 
@@ -69,7 +66,6 @@ class PredictionErrors:
     relative_interval: tuple[float, float]
     nearby_relative: float
     windows: int
-    failed_windows: int
     stride: int = 1
 
 
@@ -261,13 +257,12 @@ class Predicted(JudgedByErrors):
 
 @dataclass(frozen=True, kw_only=True)
 class Fitted(JudgedByErrors):
-    """Predictions from states that were fitted to the `fitted_steps` control steps before.
+    """Predictions from states that were fitted to the readings before.
 
     So it is where velocities are hidden, or readings so noisy that they hide what parameters do. The horizon of an
-    error is counted from the end of those steps.
+    error is counted from the last of these.
     """
 
-    fitted_steps: int
     measure: Literal["fitted"] = "fitted"
 
 

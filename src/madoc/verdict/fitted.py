@@ -52,12 +52,9 @@ def fitted(
             best,
             groups=independent_groups(replays.episodes, replays.rows, replays.readings.steps),
             horizons=replays.ahead,
-            signals=bench.simulator.task.signal_names[: len(noise)],
-            failed=int((~np.isfinite(residuals[1]).all((1, 2))).sum()),
             stride=stride(bench.problem.dataset),
         ),
         explained=explained_at_end(start_and_actions, residuals[best], replays.rows),
-        fitted_steps=replays.fitted,
     )
     return judged(
         record,

@@ -126,15 +126,12 @@ def _replayed(bench: Bench, point: Float[np.ndarray, " d"]) -> _Replayed:
     single = _single_steps(bench, points[best])
     noisy = replays.noise_floor(bench.held_out, points[best], single.noise)
     groups = independent_groups(replays.episodes, replays.rows, replays.windows.steps)
-    signals = bench.simulator.task.signal_names
     errors = prediction_errors(
         sizes,
         replays.magnitudes(noisy)[:, 0],
         best,
         groups=groups,
         horizons=replays.horizons,
-        signals=signals,
-        failed=int((~np.isfinite(residuals[1]).all((1, 2))).sum()),
         stride=stride(bench.problem.dataset),
     )
     return _Replayed(errors, points[best], residuals[best], noisy[0], single)

@@ -71,22 +71,20 @@ def prediction_errors(
     *,
     groups: Int[np.ndarray, " windows"],
     horizons: Sequence[int],
-    signals: Sequence[str],
-    failed: int,
     stride: int,
 ) -> PredictionErrors:
     """Prediction errors of several points at each horizon, with confidence intervals.
 
     `sizes` are absolute residuals at mid-range, at the estimate, then at points near it, and `floor` those that noise
-    alone would cause. `best` is the point of `best_of`, `groups` are those of `independent_groups`, `failed` is the
-    number of windows that failed at the estimate, and `stride` the control steps of the residuals' unit.
+    alone would cause. `best` is the point of `best_of`, `groups` are those of `independent_groups`, and `stride` is
+    the control steps of the residuals' unit.
     """
     means, draws = sizes.mean((0, -1)), resampled(sizes.mean(-1), groups)
     relative = relative_to_first(means)
     noise_alone = relative_to_first(np.stack([means[0], floor.mean((0, -1))]))[1]
     low, high = interval_of(relative_to_first(draws)[:, 1])
     mid_range, estimate, nearby_best, noise = (
-        _by_horizon(kind, groups, horizons, signals) for kind in (sizes[:, 0], sizes[:, 1], sizes[:, best], floor)
+        _by_horizon(kind, groups, horizons) for kind in (sizes[:, 0], sizes[:, 1], sizes[:, best], floor)
     )
     return PredictionErrors(
         mid_range=mid_range,
@@ -97,7 +95,6 @@ def prediction_errors(
         relative_interval=(float(low), float(high)),
         nearby_relative=float(max(relative[best], min(relative[1], noise_alone))),
         windows=len(sizes),
-        failed_windows=failed,
         stride=stride,
     )
 
@@ -111,12 +108,10 @@ def _by_horizon(
     sizes: Float[np.ndarray, "windows horizons signals"],
     groups: Int[np.ndarray, " windows"],
     horizons: Sequence[int],
-    signals: Sequence[str],
 ) -> tuple[PredictionError, ...]:
     low, high = interval_of(resampled(sizes.mean(-1), groups)).tolist()
-    by_signal = [dict(zip(signals, row, strict=True)) for row in sizes.mean(0).tolist()]
     means = [float(sizes[:, index].mean()) for index in range(len(horizons))]
-    columns = zip(horizons, means, zip(low, high, strict=True), by_signal, strict=True)
+    columns = zip(horizons, means, zip(low, high, strict=True), strict=True)
     return tuple(PredictionError(*row) for row in columns)
 
 
