@@ -133,7 +133,7 @@ def test_states_of_smooth_motion_settle_at_once_and_parameters_move_by_plain_ste
     assert spent == 40 * 5 * (derivatives + tried)
     assert (state.point != point).all()
     assert state.damping[0] == FIRST_DAMPING * TRIALS[0]
-    windows = UnknownStarts.at(problem, state.rows, state.touching, 5, "cauchy")
+    windows = UnknownStarts.at(problem, state.rows, 5, "cauchy")
     (plan,) = windows.plans(state.point, state.states, state.damping, state.state_damping, refining=True)
     astray = replace(plan, steps=np.concatenate([[1.0 - plan.point], plan.steps[1:]]))
     (outcome,), spent = counted(windows.outcomes, [astray], state.states, refining=True)

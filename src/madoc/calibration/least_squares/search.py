@@ -144,9 +144,13 @@ class Search:
     def step(self, problem: CalibrationProblem, state: SearchState) -> tuple[SearchState, Epoch]:
         """One damped step of every point that still moves: derivatives in one batch, the steps tried in another."""
         running, count = self._running(state), self.window_count(state)
-        windows = self.starts.at(problem, state.rows[:count], state.touching[:count], self.horizon, self.loss)
-        if isinstance(windows, UnknownStarts) and state.waiting:
-            return self._settled_states(windows, state)
+        windows: KnownStarts | UnknownStarts
+        if self.starts is KnownStarts:
+            windows = KnownStarts.at(problem, state.rows[:count], state.touching[:count], self.horizon, self.loss)
+        else:
+            windows = UnknownStarts.at(problem, state.rows[:count], self.horizon, self.loss)
+            if state.waiting:
+                return self._settled_states(windows, state)
         points, states = state.point[:running], state.states[:running, :count]
         damping, state_damping = state.damping[:running], state.state_damping[:running, :count]
         plans = windows.plans(points, states, damping, state_damping, refining=bool(state.refining))

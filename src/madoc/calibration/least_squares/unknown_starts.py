@@ -67,7 +67,6 @@ class UnknownStarts:
         cls,
         problem: CalibrationProblem,
         rows: Int[np.ndarray, " windows"],
-        touching: Bool[np.ndarray, " windows"],
         horizon: int,
         loss: Loss,
     ) -> "UnknownStarts":
