@@ -15,8 +15,10 @@ from madoc.identification.gauss_newton import (
     Eliminated,
     damped_step,
     eliminate,
+    explicable,
+    left_by,
     left_by_states,
-    states_basis,
+    spare_of,
     states_steps,
     triangular_factors,
 )
@@ -135,13 +137,12 @@ class Fit:
     @cached_property
     def left(self) -> Float[np.ndarray, "windows values"]:
         """What no initial state explains of the residuals, to first order."""
-        residuals = self.slopes.residuals[..., None]
-        return (residuals - self.explicable @ (np.swapaxes(self.explicable, 1, 2) @ residuals))[..., 0]
+        return left_by(self.explicable, self.slopes.residuals)
 
     @cached_property
     def spare(self) -> Float[np.ndarray, "windows values"]:
         """1 - leverage of each value: the share of its noise that its window's initial state does not absorb."""
-        return 1.0 - (self.explicable**2).sum(-1)
+        return spare_of(self.explicable)
 
     @cached_property
     def unexplained(self) -> float:
@@ -210,7 +211,7 @@ def _sloped(
     (slopes,) = slopes_at(simulator, readings, point[None], states[None], parameters=by_parameters is None)
     if by_parameters is not None:
         slopes = replace(slopes, by_parameters=np.where(slopes.whole[:, None, None], by_parameters, 0.0))
-    return Fit(point, states, slopes, _explicable(slopes), slopes.whole)
+    return Fit(point, states, slopes, explicable(slopes), slopes.whole)
 
 
 def _sloped_by_parameters(simulator: Simulator, readings: Readings, fit: Fit) -> Fit:
@@ -219,12 +220,6 @@ def _sloped_by_parameters(simulator: Simulator, readings: Readings, fit: Fit) ->
     residuals = np.where(slopes.whole[:, None], fit.slopes.residuals, np.nan)
     both = replace(fit.slopes, by_parameters=slopes.by_parameters).at(residuals)
     return replace(fit, slopes=both, counted=fit.counted & slopes.whole)
-
-
-def _explicable(slopes: WindowSlopes) -> Float[np.ndarray, "windows values n"]:
-    """Orthonormal columns that span what initial states explain of each window's residuals, to first order."""
-    basis, _ = states_basis(slopes.by_states)
-    return basis[:, : slopes.residuals.shape[1]]
 
 
 def _descended(simulator: Simulator, readings: Readings, fit: Fit) -> Fit:

@@ -194,9 +194,25 @@ def left_by_states(
     slopes: WindowSlopes,
 ) -> tuple[Float[np.ndarray, "windows values"], Float[np.ndarray, "windows values"]]:
     """What initial states cannot explain of the residuals, and 1 - leverage: the share of noise that they leave."""
-    basis = states_basis(slopes.by_states)[0][:, : slopes.residuals.shape[1]]
-    within = np.swapaxes(basis, 1, 2) @ slopes.residuals[..., None]
-    return slopes.residuals - (basis @ within)[..., 0], 1.0 - (basis**2).sum(-1)
+    basis = explicable(slopes)
+    return left_by(basis, slopes.residuals), spare_of(basis)
+
+
+def explicable(slopes: WindowSlopes) -> Float[np.ndarray, "windows values n"]:
+    """Orthonormal columns that span what initial states explain of each window's residuals, to first order."""
+    return states_basis(slopes.by_states)[0][:, : slopes.residuals.shape[1]]
+
+
+def left_by(
+    basis: Float[np.ndarray, "windows values n"], residuals: Float[np.ndarray, "windows values"]
+) -> Float[np.ndarray, "windows values"]:
+    """What is left of residuals without their projection on these orthonormal columns."""
+    return residuals - (basis @ (np.swapaxes(basis, 1, 2) @ residuals[..., None]))[..., 0]
+
+
+def spare_of(basis: Float[np.ndarray, "windows values n"]) -> Float[np.ndarray, "windows values"]:
+    """1 - leverage of each value: the share of its noise that these orthonormal columns do not absorb."""
+    return 1.0 - (basis**2).sum(-1)
 
 
 def states_steps(
