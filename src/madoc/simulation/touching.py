@@ -31,3 +31,20 @@ def touching_geoms(model: mujoco.MjModel, states: Float[np.ndarray, "rows state"
             known = pair[named[pair]]
             found.update((known[moves[known]] if moves[known].any() else known).tolist())
     return tuple(model.geom(index).name for index in sorted(found))
+
+
+def only_in_pairs(model: mujoco.MjModel, geom: int) -> bool:
+    """Whether a geom touches others by `<pair>` alone, whose friction and solref count there in place of its own.
+
+    Bodies that an `<exclude>` keeps apart count as if they might touch.
+    """
+    ends = np.stack([model.pair_geom1, model.pair_geom2])
+    own = ends[:, (ends == geom).any(0)]
+    weld = model.body_weldid[model.geom_bodyid]
+    parent = model.body_weldid[model.body_parentid[weld]]
+    alike = (model.geom_contype & model.geom_conaffinity[geom]) | (model.geom_contype[geom] & model.geom_conaffinity)
+    linked = (weld != 0) & (weld[geom] != 0) & ((parent == weld[geom]) | (weld == parent[geom]))
+    linked &= not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
+    others = (alike != 0) & (weld != weld[geom]) & ~linked
+    others[own] = False
+    return bool(own.size) and not others.any()
