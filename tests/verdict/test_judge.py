@@ -320,6 +320,8 @@ def test_a_small_gain_counts_where_it_is_significant_and_the_rest_is_noise(good)
     gain = {"mid_range": errors(0.1, 0.41), "relative": 0.97, "nearby_relative": 0.97} | interval
     assert judge(changed(good, gain)).word == "CALIBRATED"
     assert judge(changed(good, gain | {"relative_interval": (0.94, 1.01)})).word == "NO_IMPROVEMENT"
+    few = judge(changed(good, gain | {"relative_interval": (0.94, 1.01), "windows": 10}))
+    assert few.word == "NO_IMPROVEMENT" and "the 10 windows" in few.sentence
     left = errors(0.3, 1.2)
     loud = gain | {"estimate": left, "nearby_best": left, "mid_range": errors(0.3, 1.23)}
     assert judge(changed(good, loud)).word == ("NO_IMPROVEMENT" if good is PREDICTED else "MODEL_MISMATCH")

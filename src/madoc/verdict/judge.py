@@ -26,6 +26,7 @@ from madoc.verdict.mismatch import (
     lacking,
     of_area,
 )
+from madoc.verdict.prediction import FEWEST_WINDOWS
 from madoc.verdict.statistics import ABOVE_NOISE, FEWEST_GROUPS, WORTH_GAINING, beyond_noise
 
 UNSETTLED = "the search had not settled when its budget ended: resume it with a larger one"
@@ -255,8 +256,13 @@ def _no_improvement(holdout: HoldOut) -> Verdict | None:
     if isinstance(holdout, ToldApart):
         sentence = _no_better_areas(holdout.area_at_mid_range, holdout.area_at_estimate)
     else:
-        improved = _mid_range_was_right(holdout) or _improved_later(holdout)
+        improved, errors = _mid_range_was_right(holdout) or _improved_later(holdout), holdout.errors
         sentence = "" if improved else _no_better_errors(holdout)
+        if sentence and errors.windows < FEWEST_WINDOWS and not beats_mid_range(holdout):
+            sentence = (
+                f"{_how_small(errors)}, but the {errors.windows} windows that there were time and rows for are too few "
+                "to tell whether that is chance; give it a larger budget, or hold out more"
+            )
     return Verdict("NO_IMPROVEMENT", sentence) if sentence else None
 
 
