@@ -10,6 +10,7 @@ from madoc.calibration.holdout import Predicted, PredictionErrors
 from madoc.data import stride
 from madoc.identification import noise as sensors
 from madoc.identification.gauss_newton import DAMPING, descend
+from madoc.identification.losses import NORMAL_MAD
 from madoc.identification.states import logged_states
 from madoc.identification.windows import consecutive_rows, evenly
 from madoc.simulation.attitudes import differences
@@ -33,6 +34,8 @@ MOST_ROWS = 4000
 """Largest number of held-out rows whose residuals are compared with those of later rows."""
 TOUCHING = 0.1
 """Share in [0, 1] of held-out rows in which bodies touch; with more, noise of a state is not small for its motion."""
+ROUNDED = 3.0
+"""Standard deviations of the readings' rounding; residuals of single steps that are not larger tell of no noise."""
 
 
 def predicted(bench: Bench, point: Float[np.ndarray, " d"], interval: Float[np.ndarray, "d 2"] | None) -> Predicted:
@@ -72,24 +75,24 @@ def noise_hides_gain(bench: Bench) -> bool:
 def noisy_contacts(bench: Bench, point: Float[np.ndarray, " d"]) -> bool:
     """Whether bodies touch in the hold-out, and logged states are noisy.
 
-    Replays from these then err by what contacts make of noise. It shows in readings that alternate by more than their
-    rounding, and in residuals of single steps that do; those of an estimate with far larger errors do not. A delay that
-    the model lacks alternates with the actions: the one before a row says nothing of noise, and what it explains does
-    not count.
+    Replays from these then err by what contacts make of noise. It shows in residuals of single steps, larger than
+    readings' rounding makes them, that alternate; those of an estimate with far larger errors do not. A delay that the
+    model lacks alternates with the actions: the one before a row says nothing of noise, and what it explains does not
+    count.
     """
     states, rows = logged_states(bench.held_out, bench.simulator.task)
     seen = states[evenly(np.arange(len(states)), MOST_ROWS)]
     follows = consecutive_rows(bench.held_out, rows)
     first = rows[evenly(follows[np.isin(follows - 1, follows)], MOST_ROWS)]
-    loud = bench.problem.noise_by_differences > sensors.NOISY_STRIDE * bench.change
-    if not len(first) or not loud.any():
+    if not len(first):
         return False
     contacts = bench.simulator.contacts(seen, bench.simulator.parameters.to_physical(point.clip(-1.0, 1.0)))
     if float((contacts > 0).mean()) < TOUCHING:
         return False
     pairs = np.stack([_residuals(bench, point, each) for each in (first, first + 1)])
     whole, actions = np.isfinite(pairs).all((0, 2)), np.asarray(bench.held_out.transitions.action)
-    if not whole.any():
+    size = NORMAL_MAD * np.median(np.abs(pairs[0, whole]), axis=0) if whole.any() else np.zeros(len(bench.change))
+    if not (size > np.maximum(sensors.NOISY_STRIDE, ROUNDED * bench.problem.rounding / bench.change)).any():
         return False
     left = [_without(pairs[each, whole], actions[first[whole] + each - 1]) for each in (0, 1)]
     return min(sensors.alternation(*pairs[:, whole]), sensors.alternation(*left)) > sensors.NOISY
