@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from madoc.simulation.touching import only_in_pairs, touching_geoms
+from madoc.simulation.touching import only_in_pairs, sensing_motion, touching_geoms
 
 MODEL = """
 <mujoco><worldbody>
@@ -48,3 +48,33 @@ def test_geoms_that_touch_others_by_pairs_alone(shin, foot, pairs, alone):
     model = mujoco.MjModel.from_xml_string(LEG.format(shin=shin, foot=foot, pairs=pairs))
     names = ("floor", "shin", "foot")
     assert [name for name in names if only_in_pairs(model, model.geom(name).id)] == alone
+
+
+SENSING = """
+<mujoco><worldbody>
+  <geom type="plane" size="1 1 1"/>
+  <body pos="0 0 0.05"><freejoint/><geom size="0.1"/><site name="imu" pos="0.02 0 0.03"/>
+    <body><joint name="arm" range="-1 -0.5" limited="true"/><geom size="0.05" pos="0 0 0.2"/></body></body>
+</worldbody><sensor><gyro site="imu"/><framequat objtype="site" objname="imu"/>{more}</sensor></mujoco>
+"""
+
+
+@pytest.mark.parametrize(
+    ("more", "left_out"),
+    [("", True), ('<touch site="imu"/>', False), ('<jointlimitpos joint="arm"/>', False), ("<clock/>", True)],
+)
+def test_sensors_of_motion_read_the_same_without_contacts_and_others_keep_them(more, left_out):
+    model = mujoco.MjModel.from_xml_string(SENSING.format(more=more))
+
+    def read():
+        data = mujoco.MjData(model)
+        data.qvel[:] = np.linspace(-1.0, 1.0, model.nv)
+        mujoco.mj_step(model, data)
+        return data.sensordata.copy(), data.ncon
+
+    whole, touching = read()
+    before = model.opt.disableflags
+    with sensing_motion([model]):
+        np.testing.assert_array_equal(read()[0], whole)
+        assert read()[1] == (0 if left_out else touching) and touching > 0
+    assert model.opt.disableflags == before

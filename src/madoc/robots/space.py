@@ -7,7 +7,7 @@ from itertools import product, zip_longest
 
 import mujoco
 
-from madoc.errors import MadocError
+from madoc.errors import MadocError, listed
 from madoc.parameters import FIELDS, PAYLOAD, Parameter, ParameterSpace, field_of
 from madoc.robots.drives import friction_parameters
 from madoc.robots.grammar import parse
@@ -60,13 +60,13 @@ def _check_contacts(model: mujoco.MjModel, parameter: Parameter) -> None:
     """Refuse a number of a geom's contacts where all of these are of pairs, which have their own: it does nothing."""
     if not parameter.field.startswith(_OF_CONTACTS):
         return
-    for element, geom in zip(parameter.elements, find_elements(model, parameter), strict=True):
-        if only_in_pairs(model, geom):
-            raise MadocError(
-                f"{parameter.field} of {element!r} does nothing, as it touches others by a <pair> of the model alone, "
-                "which has its own; calibrate a number of the pair, as {model: pair_friction, index: 0, element: NAME "
-                "OF THE PAIR}, or take the pair out and give both geoms a contype and a conaffinity"
-            )
+    if all(only_in_pairs(model, geom) for geom in find_elements(model, parameter)):
+        named = listed(map(repr, parameter.elements))
+        raise MadocError(
+            f"{parameter.field} of {named} does nothing, as it touches others by a <pair> of the model alone, which "
+            "has its own; calibrate a number of the pair, as {model: pair_friction, index: 0, element: NAME OF THE PAIR}, "
+            "or take the pair out and give both geoms a contype and a conaffinity"
+        )
 
 
 def _check_payloads(draft: Draft, model: mujoco.MjModel, parameters: list[Parameter], lines: list[int]) -> None:

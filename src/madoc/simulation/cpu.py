@@ -16,7 +16,7 @@ from madoc.runs.machine import usable_cores
 from madoc.simulation.base import SIMULATED
 from madoc.simulation.delay import LAGS, action_weights, blend
 from madoc.simulation.drives import drive_forces
-from madoc.simulation.touching import collided
+from madoc.simulation.touching import collided, sensing_motion
 from madoc.simulation.user_data import install_callbacks, needs_callbacks
 from madoc.simulation.write import check_elements, conditions_of, write_parameters
 from madoc.tasks.base import Task
@@ -307,7 +307,8 @@ class CpuSystem:
         if self._simulator.task.pending:
             control = self._simulator._controls(blend(self._sensed, self._pending(state)))
         sensors = np.zeros((control.shape[0] * control.shape[1], 1, self.models[0].nsensordata))
-        moved = self._simulated(state[..., : self._physical], control, sensors=sensors)
+        with sensing_motion({model for row in self._models for model in row}):
+            moved = self._simulated(state[..., : self._physical], control, sensors=sensors)
         return np.where(np.isnan(moved[:, :, 0, :1]), np.nan, sensors.reshape(*control.shape[:2], -1))
 
     def _models_of(self, control: Float[np.ndarray, "systems rows control"]) -> list[list[mujoco.MjModel]]:

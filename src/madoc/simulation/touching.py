@@ -1,6 +1,7 @@
 """Which geoms a robot touches others with."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 
 import mujoco
 import numpy as np
@@ -47,4 +48,34 @@ def only_in_pairs(model: mujoco.MjModel, geom: int) -> bool:
     linked &= not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
     others = (alike != 0) & (weld != weld[geom]) & ~linked
     others[own] = False
-    return bool(own.size) and not others.any()
+    cloth = (model.flex_contype & model.geom_conaffinity[geom]) | (model.geom_contype[geom] & model.flex_conaffinity)
+    return bool(own.size) and not others.any() and not cloth.any()
+
+
+_OF_CONSTRAINTS = tuple(
+    int(getattr(mujoco.mjtSensor, f"mjSENS_{name}"))
+    for name in ("JOINTLIMITPOS", "JOINTLIMITVEL", "TENDONLIMITPOS", "TENDONLIMITVEL", "USER", "PLUGIN")
+)
+"""Sensors that may show constraints though they belong to positions or velocities."""
+
+
+@contextmanager
+def sensing_motion(models: Collection[mujoco.MjModel]) -> Iterator[None]:
+    """Leave constraints out of steps that are for sensors alone, where these show positions and velocities.
+
+    Contacts and limits are most of a step's work. Models with sensors of forces or accelerations stay as they are.
+    """
+    shown = [
+        model
+        for model in models
+        if (model.sensor_needstage <= int(mujoco.mjtStage.mjSTAGE_VEL)).all()
+        and not np.isin(model.sensor_type, _OF_CONSTRAINTS).any()
+    ]
+    before = [model.opt.disableflags for model in shown]
+    for model in shown:
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT
+    try:
+        yield
+    finally:
+        for model, flags in zip(shown, before, strict=True):
+            model.opt.disableflags = flags
