@@ -17,7 +17,7 @@ from madoc.simulation.write import nominal_values
 from madoc.verdict import Bench
 from madoc.verdict import open_loop as module
 from madoc.verdict.mismatch import BEYOND_RANDOM
-from madoc.verdict.open_loop import MOST, as_given, open_loop
+from madoc.verdict.open_loop import MOST, as_given, beyond_imitated, open_loop
 from madoc.verdict.statistics import ABOVE_NOISE
 
 TASK, TRUTH = ROBOTS["spring"]
@@ -119,3 +119,11 @@ def test_a_simulation_that_fails_counts_as_the_worst_that_does_not(monkeypatch):
     monkeypatch.setattr(module, "_from_logged", lambda *_: (residuals, np.arange(6) * 50))
     first = open_loop(bench, at_truth(bench))[0]
     assert first.relative == pytest.approx(np.sqrt((3 * 40.0**2 + 0.1**2) / 4) / 40.0)
+
+
+def test_signals_count_by_the_share_of_their_error_that_chance_does_not_make():
+    given, estimate, imitated = [4.0, 1.0, 1.0, 0.0], [0.1, 1.0, 9.0, 0.0], [0.1, 1.0, 1.0, 0.0]
+    shares = beyond_imitated(np.array([given, given, estimate, imitated]))
+    np.testing.assert_allclose(shares, [0.975, 0.0, 8.0 / 9.0, 1.0])  # the last has no error that chance could make
+    assert (beyond_imitated(np.array([given, given, estimate])) == 1.0).all()
+    assert (beyond_imitated(np.ones((4, 3))) == 1.0).all()  # all is chance

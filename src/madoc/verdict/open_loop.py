@@ -116,8 +116,9 @@ def _record(
     known = np.isfinite(residuals)
     worst = np.maximum(np.abs(np.where(known, residuals, 0.0)).max((0, 1, 2)), FAILED)
     size, units = np.where(known, residuals, worst), bench.change[: residuals.shape[-1]]
-    of_signals = np.sqrt((size**2).mean((1, 2))) * units
-    of_windows = np.sqrt((size**2).mean((2, 3)))  # of which means are taken, as a few windows may run away
+    squares = (size**2).mean((1, 2))
+    of_signals = np.sqrt(squares) * units
+    of_windows = np.sqrt((size**2 * beyond_imitated(squares)).mean((2, 3)))  # then means: a few may run away
     groups = independent_groups(bench.held_out.episode_of(rows), rows, steps)
     before, _, after = of_windows[:3].mean(1)
     beside = {}
@@ -139,6 +140,19 @@ def _record(
         relative_interval=(float(low), float(high)),
         beside_noise=beside,
     )
+
+
+def beyond_imitated(squares: Float[np.ndarray, "models channels"]) -> Float[np.ndarray, " channels"]:
+    """The share in [0, 1] of each channel's squared error, as given or at the estimate, that chance does not make.
+
+    Channels count by it: of an object that does not turn all errors of its turning are noise. It is 1 where nothing
+    was imitated, or all is chance.
+    """
+    if len(squares) <= 3:
+        return np.ones(squares.shape[1])
+    largest = np.maximum(np.maximum(squares[0], squares[2]), np.finfo(float).tiny)
+    beyond = np.clip(1.0 - squares[3] / largest, 0.0, 1.0)
+    return beyond if beyond.any() else np.ones_like(beyond)
 
 
 def _from_logged(
