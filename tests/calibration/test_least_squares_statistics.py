@@ -139,9 +139,9 @@ def test_rounding_of_counts_is_no_long_tail():
     log = recorded(spring(), SPRING_TRUTH, 40, jax.random.key(0))
     problem = CalibrationProblem(log, simulation.make(spring(), threads=1))
     residuals = np.repeat([0.1, 0.1, 1.0], 30)[:, None] * np.random.default_rng(0).uniform(-1.7, 1.7, (90, 4))
-    counted = UnknownStarts.at(problem, np.array([0, 10]), 1, "cauchy")
+    starts = UnknownStarts.at(problem, np.array([0, 10]), 1, "cauchy")
     deviation = np.full(2, 0.1)
-    fine, coarse = (replace(counted, rounding=np.full(2, size))._tail_cost for size in (0.0, 1.0))
+    fine, coarse = (replace(starts, rounding=np.full(2, size))._tail_cost for size in (0.0, 1.0))
     assert fine(residuals / deviation[0], deviation) > LONG_TAILS
     assert coarse(residuals / deviation[0], deviation) < 0.5
     assert fine(residuals[:0], deviation) == 0.0

@@ -44,7 +44,7 @@ def test_the_refusal_names_several_and_the_rows_there_were(spring_task):
         refuse_insensitive(simulator, *logged(5), key=KEY)
 
 
-def test_nothing_to_refuse_gives_the_control_steps(spring_task):
+def test_each_parameter_is_simulated_at_both_ends_of_its_range(spring_task):
     simulator = CpuSimulator(spring_task(STIFFNESS, DAMPING), threads=1)
     assert counted(refuse_insensitive, simulator, *logged(), key=KEY)[1] == 64 * 5
     assert counted(refuse_insensitive, simulator, *logged(10), key=KEY)[1] == 10 * 5

@@ -15,6 +15,8 @@ from madoc.calibration import CalibrationProblem, CalibrationResult, LeastSquare
 from madoc.data.split import hold_out
 from madoc.errors import MadocError
 from madoc.identification.candidate_terms import INTEGRATION
+from madoc.identification.missing_terms import Suspicions
+from madoc.identification.term_tests import Alternative
 from madoc.verdict import Bench
 from own_robots import SPRING_SPEC, write_robot
 from robots import SPRING_TRUTH, recorded
@@ -68,6 +70,19 @@ def test_without_time_nothing_is_said_to_be_tested(result, split):
     in_full = madoc.assess(result, replace(bench, until=time.monotonic() + 1000.0, rate=1e5))
     assert max(in_full.holdout.open_loop[0].beside_noise.values()) < 1.3
     assert in_full.verdict.word == "CALIBRATED" and in_full.holdout == madoc.assess(result, bench).holdout
+
+
+def test_what_only_tests_on_few_windows_leave_open_asks_for_time(result, split, monkeypatch):
+    name = next(iter(result.parameters))
+    wide = Suspicions(alternatives=(Alternative(("friction",), {name: 0.0}, {name: 1e6}),))
+    monkeypatch.setattr("madoc.verdict.records.suspicions", lambda *_, **__: wide)
+    bench = Bench(CalibrationProblem(split.kept, simulation.make(TASK, threads=1)), split.held, jax.random.key(0))
+    assert (found := madoc.assess(result, bench)).holdout.open_in_time == ()
+    assert (found.verdict.word, found.verdict.parameters) == ("NOT_IDENTIFIABLE", (name,))
+    rate = 1.01 * bench.windows_to_test * replace(bench, rate=1.0).window_seconds / 1000.0
+    few = madoc.assess(result, replace(bench, until=time.monotonic() + 1000.0, rate=rate))
+    assert few.holdout.open_in_time == few.verdict.parameters == (name,)
+    assert f"leaves {name} open; give it more time" in few.verdict.sentence
 
 
 def test_a_log_of_a_finer_simulation_is_judged_with_a_finer_step_and_its_truth_is_covered(tmp_path):

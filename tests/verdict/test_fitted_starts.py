@@ -77,7 +77,8 @@ def test_the_hold_out_leaves_time_for_tests_of_the_model(monkeypatch):
     monkeypatch.setattr("madoc.verdict.bench.time.monotonic", lambda: 90.0)
     to_test = judged.windows_to_test * replace(judged, rate=1.0).window_seconds  # control steps
     columns = replay_steps(judged.states, 1, len(ARM.parameters))
-    shares = ((0.3, 0.4), (0.65, 0.35), (1.5, 0.1))  # of the time left for tests, and then for the hold-out
+    # Of the time left for tests, and then for the hold-out; where tests leave less than a tenth they are left out.
+    shares = ((0.3, 0.4), (0.65, 0.35), (0.89, 0.11), (0.95, 0.4), (1.5, 0.4))
     for share, of_hold_out in shares:
         timed = replace(judged, rate=to_test / share / 10.0)
         affordable = int(of_hold_out * timed.rate * 10.0 / columns)

@@ -53,9 +53,10 @@ def calibrate(
     true_values = None if truth is None else space.vector(truth)
     entry = entry_of(method, CALIBRATORS)
     method.init(problem, key)  # a refusal of the method comes before one of the parameters
+    probe = problem.probe if entry.simulates else None  # kept by the problem, and so no step of this calibration
     began = SIMULATED.control_steps
-    if entry.simulates:
-        refuse_insensitive(problem.simulator, *problem.probe, key=jax.random.key(0))
+    if probe is not None:
+        refuse_insensitive(problem.simulator, *probe, key=jax.random.key(0))
     probing = SIMULATED.control_steps - began
     finished = loop.run(
         method,

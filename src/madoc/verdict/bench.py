@@ -31,8 +31,8 @@ FEWEST_HELD = 10
 _NEIGHBOURS = 5000
 """Largest number of training rows among which the nearest neighbour of a row held out is searched."""
 FITTING, LEAST_FITTING = 0.4, 0.1
-"""Largest and least share in (0, 1) of the time left that fitting the starts of windows of the hold-out may take: the
-largest unless that leaves no time for tests of what the model lacks, for which there is some."""
+"""Share in (0, 1) of the time left that fitting the starts of the hold-out's windows may take, and the least: where
+tests of what the model lacks leave less, there is no time for them."""
 COLUMNS, COLUMNS_OF_A_VALUE = 60, 20
 """Simulations of a window that testing a model takes about, and how many more for each parameter and each degree of
 freedom."""
@@ -159,7 +159,7 @@ class Bench:
         columns = replay_steps(self.states, stride(self.problem.dataset), len(self.simulator.parameters))
         count = len(self.fittable.rows)
         room = 1.0 - self.windows_to_test * self.window_seconds / max(self.seconds_left, 1e-9)
-        share = float(np.clip(room, LEAST_FITTING, FITTING)) if room > 0.0 else FITTING
+        share = min(room, FITTING) if room >= LEAST_FITTING else FITTING
         most = self.windows_in_time(columns, share, count)
         return replace(self.fittable.of(evenly(np.arange(count), most)), most_steps=self.steps_in_time(most * columns))
 

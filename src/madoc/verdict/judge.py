@@ -195,7 +195,7 @@ def _untested(holdout: HoldOut) -> Verdict | None:
             "whether the model lacks anything was not tested: the log has too few windows that the model can follow, "
             "or the budget was too short; log more, or in longer runs, or give it more time"
         )
-    return _not_certain(holdout, why)
+    return _not_certain(holdout, why, holdout.open_in_time if holdout.tested else ())
 
 
 def _beyond_noise_later(holdout: HoldOut) -> Verdict | None:
@@ -246,10 +246,10 @@ def _unsettled(holdout: HoldOut) -> Verdict:
     )
 
 
-def _not_certain(holdout: HoldOut, why: str) -> Verdict:
+def _not_certain(holdout: HoldOut, why: str, parameters: tuple[str, ...] = ()) -> Verdict:
     """An estimate that predicts, but whose intervals do not count something."""
-    found = _usable(holdout, Verdict("MODEL_MISMATCH", why))
-    return found or Verdict("NOT_IDENTIFIABLE", f"{_how_good(holdout)}, but {why}")
+    found = _usable(holdout, Verdict("MODEL_MISMATCH", why, parameters))
+    return found or Verdict("NOT_IDENTIFIABLE", f"{_how_good(holdout)}, but {why}", parameters)
 
 
 def _no_improvement(holdout: HoldOut) -> Verdict | None:
@@ -257,8 +257,9 @@ def _no_improvement(holdout: HoldOut) -> Verdict | None:
         sentence = _no_better_areas(holdout.area_at_mid_range, holdout.area_at_estimate)
     else:
         improved, errors = _mid_range_was_right(holdout) or _improved_later(holdout), holdout.errors
+        low, high = errors.relative_interval
         sentence = "" if improved else _no_better_errors(holdout)
-        if sentence and errors.windows < FEWEST_WINDOWS and not beats_mid_range(holdout):
+        if sentence and errors.windows < FEWEST_WINDOWS and low <= 1.0 <= high:
             sentence = (
                 f"{_how_small(errors)}, but the {errors.windows} windows that there were time and rows for are too few "
                 "to tell whether that is chance; give it a larger budget, or hold out more"
@@ -330,7 +331,8 @@ def _no_better_areas(before: Area, after: Area) -> str:
 
 def _how_good(holdout: HoldOut) -> str:
     if not isinstance(holdout, ToldApart):
-        confirmed = ", and mid-range is confirmed: every interval holds it" if _mid_range_was_right(holdout) else ""
+        right = _mid_range_was_right(holdout) and not holdout.open_in_time
+        confirmed = ", and mid-range is confirmed: every interval holds it" if right else ""
         told = _how_small(holdout.errors) if holdout.ahead is None else _beside_given(holdout.ahead, holdout.noise)
         ahead = f", up to {in_rows(holdout.errors.estimate[-1].steps)} ahead as well as the sensors' noise allows"
         noise_alone = not beyond_noise(holdout.errors.estimate, holdout.errors.noise)

@@ -17,7 +17,7 @@ from madoc.diagnosis.scales import coarseness
 from madoc.identification.candidate_effects import FINER
 from madoc.identification.candidate_terms import DELAY, INTEGRATION, LAG
 from madoc.identification.excitation import expected_half_widths
-from madoc.identification.fitted_windows import SHORTER, WINDOWS
+from madoc.identification.fitted_windows import SHORTER, windows_of
 from madoc.identification.information import OPEN
 from madoc.identification.missing_terms import OTHER_WINDOWS, Suspicions, suspicions
 from madoc.identification.term_tests import Alternative, MissingTerm
@@ -78,8 +78,10 @@ def _doubts(
     part = "tests of what the model lacks" if shorter == 1 else "the same tests on shorter windows"
     if not bench.begins(part, 0.0 if enough else np.inf):
         return Suspicions(tested=False), False
-    if shorter == 1 and most is not None and most < WINDOWS:
-        bench.left_out.append(FEWER)
+    if shorter == 1 and most is not None:
+        usual = windows_of(*given, bench.change, fewest=bench.windows_to_test)
+        if most < len(usual.rows):
+            bench.left_out.append(FEWER)
     doubts = suspicions(*given, problem.simulator, point, half_widths, bench.change, most=most, shorter=shorter)
     alternatives = in_full((*doubts.alternatives, *of_small_terms(doubts.terms)), doubts.terms)
     doubts = replace(doubts, alternatives=alternatives)
@@ -163,7 +165,7 @@ def judged(
         coarseness=coarse,
         finer=finer,
         at_end=tuple(
-            name for name in space.at_end(point, ends) if of_range[name] < OPEN
+            name for name in space.at_end(point, ends) if narrower[space.names.index(name)] < OPEN
         ),  # an open one tells of no end
         concentration=doubts.concentration,
     )
