@@ -64,8 +64,8 @@ def _check_contacts(model: mujoco.MjModel, parameter: Parameter) -> None:
         named = listed(map(repr, parameter.elements))
         raise MadocError(
             f"{parameter.field} of {named} does nothing, as it touches others by a <pair> of the model alone, which "
-            "has its own; calibrate a number of the pair, as {model: pair_friction, index: 0, element: NAME OF THE PAIR}, "
-            "or take the pair out and give both geoms a contype and a conaffinity"
+            "has its own; calibrate a number of the pair, as {model: pair_friction, index: 0, element: NAME OF THE "
+            "PAIR}, or take the pair out and give both geoms a contype and a conaffinity"
         )
 
 
