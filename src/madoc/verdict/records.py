@@ -138,11 +138,14 @@ def judged(
     own = best
     if interval is not None:  # to the farther end, as the other may be cut off at an end of the range
         own = np.maximum(np.abs(space.to_unit(interval.T) - point).max(0), 1e-9)
-    doubts, finer = _doubts(bench, point, own)
-    contradicting = _contradictions(bench, point, at, doubts)
-    coarse = 0.0
+    coarse, exchanged = 0.0, _exchanged(bench, point, at)  # tests take what is left of the time
     if bench.simulator.task.source is not None and bench.begins("the length of the timestep"):
         coarse = coarseness(problem.dataset, bench.states, problem.simulator, point, bench.change)
+    doubts, finer = _doubts(bench, point, own)
+    # Actions that seem late are none where tests at the estimate exclude it.
+    in_time = actions_in_time(doubts.terms, bench.simulator.control_step)
+    against = (each for each in (*exchanged, *problem.dataset.findings) if each.contradicts)
+    contradicting = tuple(each for each in against if not (each.late and in_time))
     ends = point[:, None] + np.outer(own, (-1.0, 1.0)) if interval is None else space.to_unit(interval.T).T
     widths = space, point[:, None] + np.outer(best, (-1.0, 1.0)), ends, own
     shares = _shares(*widths, doubts.alternatives)
@@ -274,25 +277,14 @@ def _best_half_widths(
     return np.minimum(half, fitted)
 
 
-def _contradictions(
-    bench: Bench, point: Float[np.ndarray, " d"], at: Float[np.ndarray, " d"], doubts: Suspicions
-) -> tuple[Finding, ...]:
-    """Findings of the log that contradict the spec.
-
-    Actions that seem late are none where tests at the estimate exclude it. Sizes that the log alone tells roughly are
-    findings only where errors are far beyond noise and nothing else explains them, which is seen later.
-    """
-    simulator, dataset = bench.simulator, bench.problem.dataset
-    found = dataset.findings
-    possible = simulator.task.state_from_observation is not None and bench.held_out.disturbance.shuffled == "none"
-    if possible and bench.begins(EXCHANGED):
-        points = np.stack([np.zeros(len(point)), point, at])
-        exchanged = exchanged_columns(
-            bench.held_out, simulator, points, horizons(dataset)[1], bench.change, contradicts=True
-        )
-        found = (*exchanged, *found)
-    in_time = actions_in_time(doubts.terms, simulator.control_step)
-    return tuple(each for each in found if each.contradicts and not (each.late and in_time))
+def _exchanged(bench: Bench, point: Float[np.ndarray, " d"], at: Float[np.ndarray, " d"]) -> tuple[Finding, ...]:
+    """Findings of columns of the log that are exchanged."""
+    simulator, held = bench.simulator, bench.held_out
+    possible = simulator.task.state_from_observation is not None and held.disturbance.shuffled == "none"
+    if not possible or not bench.begins(EXCHANGED):
+        return ()
+    points, steps = np.stack([np.zeros(len(point)), point, at]), horizons(bench.problem.dataset)[1]
+    return tuple(exchanged_columns(held, simulator, points, steps, bench.change, contradicts=True))
 
 
 def _shares(
