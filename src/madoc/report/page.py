@@ -149,7 +149,8 @@ def _on_holdout(held: HoldOut) -> tuple[str, str, str]:
         return "classifier, simulated or logged", number(held.area_at_estimate.area, 2), note
     if held.ahead is not None:
         value, low, high = map(percent, (held.ahead.relative, *held.ahead.relative_interval))
-        note = f"of your model's as given, over {number(held.ahead.seconds, 3)} s and all signals; {low} to {high}"
+        ahead = f"over {number(held.ahead.seconds, 3)} s, but for signals that are noise alone"
+        note = f"of your model's as given, {ahead}; {low} to {high}"
         return "error on the hold-out", value, note
     value, low, high = map(percent, (held.score, *held.score_interval))
     return "error on the hold-out", value, f"of that at mid-range, over all times and signals; {low} to {high}"
