@@ -82,7 +82,8 @@ class OpenLoop:
         mid_range: The same with every parameter at the middle of its range.
         estimate: The same at the estimate.
         relative: Error at the estimate over that of the model as given: the mean over stretches of the root mean square
-            over all signals, each in units of its change and by the share of its squared error that chance does not make.
+            over all signals, each in units of its change and by the share of its squared error that chance does not
+            make.
         relative_interval: 95 % confidence interval of that, by resampling episodes, or stretches where these are few.
         beside_noise: How many times as large the error at the estimate is, at least, as that which the sensors' noise,
             random forces where predictions begin at logged states, and the estimate's uncertainty make; for each
