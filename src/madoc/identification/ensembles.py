@@ -42,7 +42,8 @@ NOISE_ROUNDS = 2
 LEAST_NOISE = 1e-3
 """Smallest noise of a channel before windows, in its typical changes, and later relative to that of any channel."""
 SPOILT = 3
-"""Number of first steps whose errors do not count where velocities are differences, which hold the next position."""
+"""Number of first steps whose errors do not count. States are drawn about single readings, in which noise decides what
+touches, and velocities that are differences hold the next position; some steps of the filter put that right."""
 _SMALLEST = 1e-100
 
 
@@ -231,14 +232,9 @@ def with_noise(
     """
     for _ in range(rounds):
         members = members_at(dataset, logged, simulator, rows, noise * readings.scale, count, random)
-        found = innovations(simulator, readings, point[None], members, noise, first=first_counted(logged, simulator))
+        found = innovations(simulator, readings, point[None], members, noise, first=SPOILT)
         noise = next_noise(noise, found.noise_ratio(), rounding)
     return found, noise
-
-
-def first_counted(logged: LoggedStates, simulator: Simulator) -> int:
-    """The first step whose errors count."""
-    return 0 if _of_one_row(logged, simulator) else SPOILT
 
 
 def _of_one_row(logged: LoggedStates, simulator: Simulator) -> bool:

@@ -27,7 +27,7 @@ from madoc.calibration.least_squares.instruments import (
 from madoc.calibration.least_squares.plan import FEWEST, Found
 from madoc.calibration.least_squares.statistics import LONG_TAILS, touched
 from madoc.data import stride
-from madoc.identification.ensembles import Innovations, first_counted, innovations, next_noise, with_noise
+from madoc.identification.ensembles import SPOILT, Innovations, innovations, next_noise, with_noise
 from madoc.identification.gauss_newton import FIRST_DAMPING, TRIALS, damped_step
 from madoc.identification.information import sandwich
 from madoc.identification.losses import Loss
@@ -220,9 +220,7 @@ def of_contacts(
     """
     states, count = problem.states, len(problem.simulator.parameters)
     horizon, fewest = horizon or horizon_of(problem), FEWEST + count
-    short = horizon < first_counted(states, problem.simulator) + 2 or not len(
-        rows_that_fit(problem.dataset, states.rows, horizon)
-    )
+    short = horizon < SPOILT + 2 or not len(rows_that_fit(problem.dataset, states.rows, horizon))
     if short or not states.starts_known:
         return None
     rows = states.rows[disjoint_windows(problem.dataset, states.rows, horizon)]

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.stats import norm
 
 from madoc.calibration.base import CalibrationProblem
-from madoc.identification.ensembles import Innovations, few_of, first_counted, innovations, members_at
+from madoc.identification.ensembles import SPOILT, Innovations, few_of, innovations, members_at
 from madoc.identification.linearisation import LEAST_CURVATURE
 from madoc.identification.losses import TUNING, Loss, curvature_share, loss_slope
 from madoc.identification.replay import Readings
@@ -77,7 +77,7 @@ class Side:
         members = members_at(problem.dataset, states, simulator, rows, noise * readings.scale, count, random)
         few = few_of(members, FEW, states.physical_size)
         above, below = (np.clip(point + sign * spread.T, -1.0, 1.0) for sign in (1, -1))
-        found = innovations(simulator, readings, point[None], members, noise, first=first_counted(states, simulator))
+        found = innovations(simulator, readings, point[None], members, noise, first=SPOILT)
         ends = innovations(simulator, readings, np.concatenate([above, below]), few, noise, like=found)
         return cls(few, found, ends, above - below, (above + below).mean(0) / 2.0 - point)
 
