@@ -4,7 +4,7 @@ import pytest
 
 from madoc import robots
 from madoc.errors import MadocError
-from own_robots import ARM_SPEC, BOUNCER, BOUNCER_SPEC, CART, CART_SPEC, task_of, write_robot
+from own_robots import ARM_SPEC, CART, CART_SPEC, write_robot
 
 ACTION = "  - {name: shoulder_motor, actuator: shoulder, low: -1, high: 1}"
 
@@ -341,32 +341,3 @@ def test_a_unit_that_nobody_knows(tmp_path):
     changed = ARM_SPEC.replace(ACTION, ACTION.replace("high: 1}", "high: 1, unit: degrees}"))
     with pytest.raises(MadocError, match=r"line 11: expected a unit that is known, got 'degrees'; nearest: deg"):
         robots.load(write_robot(tmp_path, changed))
-
-
-PAIRED = BOUNCER.replace('<geom type="plane"', '<geom name="floor" type="plane"').replace(
-    'size=".05" pos', 'name="foot" size=".05" pos'
-)
-PAIRED = PAIRED.replace(
-    "  <actuator>", '  <contact><pair name="sole" geom1="foot" geom2="floor"/></contact>\n  <actuator>'
-)
-
-
-@pytest.mark.parametrize(
-    "of_foot", ["field: geom_friction", "field: contact_time", "field: contact_damping", "model: geom_solimp, index: 0"]
-)
-def test_a_geom_whose_contacts_are_all_of_pairs_has_no_friction_of_its_own(tmp_path, of_foot):
-    line = f"  - {{{of_foot}, element: foot, low: 0.01, high: 0.9}}\n"
-    spec = BOUNCER_SPEC.replace("max_episode", line + "max_episode")
-    name = of_foot.partition(": ")[2].replace(", index: ", r"\[").replace("0", r"0\]")
-    said = rf"robot.yaml, line 16: {name} of 'foot' does nothing, as it touches others by a <pair> of the model alone"
-    with pytest.raises(MadocError, match=said):
-        task_of(tmp_path, spec, bouncer=PAIRED)
-    task = task_of(
-        tmp_path,
-        spec.replace(of_foot + ", element: foot", "model: pair_friction, index: 0, element: sole"),
-        bouncer=PAIRED,
-    )
-    assert task.parameters.names[-1] == "pair_friction[0].sole"
-    both = PAIRED.replace('contype="0" conaffinity="0"/>', '/>\n      <geom type="sphere" size=".01" pos=".3 0 0"/>', 1)
-    also = both.replace("  <worldbody>", '  <worldbody>\n    <geom type="plane" size="5 5 .1" pos="0 0 -1"/>')
-    assert len(task_of(tmp_path, spec, bouncer=also).parameters) == 4

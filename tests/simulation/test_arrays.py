@@ -141,7 +141,7 @@ parameters:
   - {field: geom_friction, each: ["fo*", box], name: grip, low: 0.1, high: 1}
   - {model: geom_solref, index: 0, element: foot, unit: s, low: 0.01, high: 0.1}
 """,
-        leg=LEG.replace('<pair name="step" geom1="foot" geom2="floor"/>', ""),
+        leg=LEG,
     )
     parameters = robots.load(spec).task.parameters.parameters
     assert [(row.name, row.elements) for row in parameters] == [

@@ -13,7 +13,6 @@ from madoc.robots.model import is_single, is_slide
 from madoc.robots.recipes import Ends, Recipe
 from madoc.robots.space import element_unit, gain_unit
 from madoc.robots.strength import FREE, actuators_of, is_servo, strengths
-from madoc.simulation.touching import only_in_pairs
 from madoc.simulation.write import OF_A_JOINT, element_names, find_elements, has_gain, heavy_bodies, nominal_values
 
 MOST = 40
@@ -221,8 +220,7 @@ def _brakes(model: mujoco.MjModel, servos: list[str], *, wanted: bool) -> Iterat
 def _contacts(model: mujoco.MjModel, wheels: set[str]) -> Iterator[Proposal]:
     """Friction of geoms that can touch; that of wheels is wanted."""
     geoms = [model.geom(name) for name in element_names(model, "geom")]
-    able = (geom for geom in geoms if geom.contype[0] or geom.conaffinity[0])
-    touching = [geom for geom in able if not only_in_pairs(model, geom.id)]
+    touching = [geom for geom in geoms if geom.contype[0] or geom.conaffinity[0]]
     bodies = {int(model.joint(wheel).bodyid[0]) for wheel in wheels}
     rolling = [geom.name for geom in touching if int(geom.bodyid[0]) in bodies]
     yield from _scaled(model, "geom_friction", rolling, wanted=True)

@@ -7,18 +7,13 @@ from itertools import product, zip_longest
 
 import mujoco
 
-from madoc.errors import MadocError, listed
 from madoc.parameters import FIELDS, PAYLOAD, Parameter, ParameterSpace, field_of
 from madoc.robots.drives import friction_parameters
 from madoc.robots.grammar import parse
 from madoc.robots.model import Draft, is_slide
 from madoc.robots.signals import signal_unit
 from madoc.simulation.arrays import check_field
-from madoc.simulation.touching import only_in_pairs
 from madoc.simulation.write import OF_A_JOINT, element_names, find_elements, nominal_values, same_numbers
-
-_OF_CONTACTS = ("geom_friction", "contact_", "geom_sol", "geom_margin", "geom_gap")
-"""Beginnings of the fields and arrays of a geom that MuJoCo takes a contact's numbers from."""
 
 
 def parameter_space(draft: Draft, model: mujoco.MjModel) -> ParameterSpace:
@@ -33,7 +28,6 @@ def parameter_space(draft: Draft, model: mujoco.MjModel) -> ParameterSpace:
             parameter = given.parameter(field, shared, _unit_of(draft, model, index, shared))
             with draft.document.at("parameters", index):
                 nominal_values(model, parameter)  # which the model may lack
-                _check_contacts(model, parameter)
             if parameter.field == "gravity" and parameter.high > 0.0:
                 problem = f"gravity is negative where it points down, got a range up to {parameter.high:g}"
                 raise draft.document.error(
@@ -54,19 +48,6 @@ def by_condition(draft: Draft, parameters: list[Parameter], lines: list[int]) ->
     for parameter, line in zip_longest(parameters, lines):
         by = None if line is None else draft.spec.parameters[line].by
         yield from [parameter] if by is None else (replace(parameter, when=(by, value)) for value in values[by])
-
-
-def _check_contacts(model: mujoco.MjModel, parameter: Parameter) -> None:
-    """Refuse a number of a geom's contacts where all of these are of pairs, which have their own: it does nothing."""
-    if not parameter.field.startswith(_OF_CONTACTS):
-        return
-    if all(only_in_pairs(model, geom) for geom in find_elements(model, parameter)):
-        named = listed(map(repr, parameter.elements))
-        raise MadocError(
-            f"{parameter.field} of {named} does nothing, as it touches others by a <pair> of the model alone, which "
-            "has its own; calibrate a number of the pair, as {model: pair_friction, index: 0, element: NAME OF THE "
-            "PAIR}, or take the pair out and give both geoms a contype and a conaffinity"
-        )
 
 
 def _check_payloads(draft: Draft, model: mujoco.MjModel, parameters: list[Parameter], lines: list[int]) -> None:

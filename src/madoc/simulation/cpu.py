@@ -307,7 +307,7 @@ class CpuSystem:
         if self._simulator.task.pending:
             control = self._simulator._controls(blend(self._sensed, self._pending(state)))
         sensors = np.zeros((control.shape[0] * control.shape[1], 1, self.models[0].nsensordata))
-        with sensing_motion({model for row in self._models for model in row}):
+        with sensing_motion([model for row in self._models for model in row]):
             moved = self._simulated(state[..., : self._physical], control, sensors=sensors)
         return np.where(np.isnan(moved[:, :, 0, :1]), np.nan, sensors.reshape(*control.shape[:2], -1))
 

@@ -1,6 +1,6 @@
-"""Which geoms a robot touches others with."""
+"""Which geoms a robot touches others with, and steps without contacts, where sensors do not show them."""
 
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 import mujoco
@@ -34,24 +34,6 @@ def touching_geoms(model: mujoco.MjModel, states: Float[np.ndarray, "rows state"
     return tuple(model.geom(index).name for index in sorted(found))
 
 
-def only_in_pairs(model: mujoco.MjModel, geom: int) -> bool:
-    """Whether a geom touches others by `<pair>` alone, whose friction and solref count there in place of its own.
-
-    Bodies that an `<exclude>` keeps apart count as if they might touch.
-    """
-    ends = np.stack([model.pair_geom1, model.pair_geom2])
-    own = ends[:, (ends == geom).any(0)]
-    weld = model.body_weldid[model.geom_bodyid]
-    parent = model.body_weldid[model.body_parentid[weld]]
-    alike = (model.geom_contype & model.geom_conaffinity[geom]) | (model.geom_contype[geom] & model.geom_conaffinity)
-    linked = (weld != 0) & (weld[geom] != 0) & ((parent == weld[geom]) | (weld == parent[geom]))
-    linked &= not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
-    others = (alike != 0) & (weld != weld[geom]) & ~linked
-    others[own] = False
-    cloth = (model.flex_contype & model.geom_conaffinity[geom]) | (model.geom_contype[geom] & model.flex_conaffinity)
-    return bool(own.size) and not others.any() and not cloth.any()
-
-
 _OF_CONSTRAINTS = tuple(
     int(getattr(mujoco.mjtSensor, f"mjSENS_{name}"))
     for name in ("JOINTLIMITPOS", "JOINTLIMITVEL", "TENDONLIMITPOS", "TENDONLIMITVEL", "USER", "PLUGIN")
@@ -60,22 +42,21 @@ _OF_CONSTRAINTS = tuple(
 
 
 @contextmanager
-def sensing_motion(models: Collection[mujoco.MjModel]) -> Iterator[None]:
+def sensing_motion(models: Sequence[mujoco.MjModel]) -> Iterator[None]:
     """Leave constraints out of steps that are for sensors alone, where these show positions and velocities.
 
-    Contacts and limits are most of a step's work. Models with sensors of forces or accelerations stay as they are.
+    Contacts and limits are most of a step's work. Models with sensors of forces or accelerations stay as they are; all
+    of them have the same sensors.
     """
-    shown = [
-        model
-        for model in models
-        if (model.sensor_needstage <= int(mujoco.mjtStage.mjSTAGE_VEL)).all()
-        and not np.isin(model.sensor_type, _OF_CONSTRAINTS).any()
-    ]
-    before = [model.opt.disableflags for model in shown]
-    for model in shown:
+    of_forces = models[0].sensor_needstage > int(mujoco.mjtStage.mjSTAGE_VEL)
+    if of_forces.any() or np.isin(models[0].sensor_type, _OF_CONSTRAINTS).any():
+        yield
+        return
+    before = [model.opt.disableflags for model in models]
+    for model in models:
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT
     try:
         yield
     finally:
-        for model, flags in zip(shown, before, strict=True):
+        for model, flags in zip(models, before, strict=True):
             model.opt.disableflags = flags

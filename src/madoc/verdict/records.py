@@ -284,7 +284,7 @@ def _exchanged(bench: Bench, point: Float[np.ndarray, " d"], at: Float[np.ndarra
     if not possible or not bench.begins(EXCHANGED):
         return ()
     points, steps = np.stack([np.zeros(len(point)), point, at]), horizons(bench.problem.dataset)[1]
-    return tuple(exchanged_columns(held, simulator, points, steps, bench.change, contradicts=True))
+    return exchanged_columns(held, simulator, points, steps, bench.change, contradicts=True)
 
 
 def _shares(
