@@ -8,8 +8,8 @@ from planted_logs import ROBOTS, bench, log_of
 
 from madoc import simulation
 from madoc.data import Disturbance, disturb, hide_velocities
+from madoc.identification import fitted_windows
 from madoc.identification.linearisation import WindowSlopes
-from madoc.verdict import fitted
 from madoc.verdict.bench import FEWEST_FITTED
 from madoc.verdict.fitted_starts import fitted_replays_of, replay_steps
 from robots import counted
@@ -58,11 +58,12 @@ def test_starts_near_those_of_another_system_are_as_good_and_no_better():
 def test_the_best_nearby_is_the_estimate_where_every_simulation_fails(monkeypatch):
     replays = replays_under(0.2)
     windows = len(replays.readings)
-    parts = np.zeros((windows, 1)), np.zeros((windows, 1, 1)), np.zeros((windows, 1, 1))
+    values = replays.readings.observed[0].size
+    parts = np.zeros((windows, values)), np.zeros((windows, values, 4)), np.zeros((windows, values, 4))
     failed = WindowSlopes(*parts, whole=np.zeros(windows, dtype=bool))
-    monkeypatch.setattr(fitted, "slopes_at", lambda *_: [failed])
-    points = fitted._nearby_best(replays, AT_TRUTH[0], replays.near)
-    np.testing.assert_array_equal(points, AT_TRUTH)
+    monkeypatch.setattr(fitted_windows, "slopes_at", lambda *_, **__: [failed])
+    nearby = fitted_windows.fit_windows(replays.simulator, replays.readings, replays.near, AT_TRUTH[0])
+    np.testing.assert_array_equal(nearby.point, AT_TRUTH[0])
 
 
 def test_starts_take_fewer_steps_where_time_is_short(monkeypatch):

@@ -9,10 +9,8 @@ from jaxtyping import Float
 
 from madoc.calibration.holdout import AgainstChance, Fitted
 from madoc.data import stride
-from madoc.identification.gauss_newton import DAMPING, damped_step, eliminate, triangular_factors
-from madoc.identification.losses import curvature_share, loss_slope, scale_of
+from madoc.identification.fitted_windows import fit_windows
 from madoc.identification.noise import residual_noise
-from madoc.identification.replay import slopes_at
 from madoc.simulation.attitudes import moved
 from madoc.verdict.bench import Bench
 from madoc.verdict.fitted_starts import FittedReplays
@@ -21,21 +19,18 @@ from madoc.verdict.records import judged
 from madoc.verdict.statistics import best_of, better_than_chance, independent_groups, prediction_errors
 from madoc.verdict.systematic import explained_at_end
 
-NEARBY_STEPS = 6
-"""Largest number of Gauss-Newton steps from an estimate, at least 1: enough to reach the nearest local minimum."""
-GAIN = 0.01
-"""Share in (0, 1) by which a step has to change the residuals' scale for another one to follow."""
-_CANDIDATES = 2
-"""Number of last points whose predictions are compared: an earlier one may be better where the last went too far."""
-
 
 def fitted(
     bench: Bench, replays: FittedReplays, point: Float[np.ndarray, " d"], interval: Float[np.ndarray, "d 2"] | None
 ) -> Fitted:
-    """The errors of an estimate, in [-1, 1], of mid-range, of the best parameters nearby, and of noise alone."""
+    """The errors of an estimate, in [-1, 1], of mid-range, of the best parameters nearby, and of noise alone.
+
+    Those nearby have been fitted to whole windows of the hold-out itself, so they are no estimate: they show what
+    parameters could reach.
+    """
     given = np.stack([np.zeros(len(point)), point])
     starts = replays.starts(given)
-    nearby = _nearby_best(replays, point, starts[1])
+    nearby = fit_windows(replays.simulator, replays.readings, starts[1], point).point[None]
     points = np.concatenate([given, nearby])
     residuals = np.concatenate([replays.residuals_from(given, starts), replays.residuals(nearby, starts[1])])
     sizes = magnitudes(replays.at_horizons(residuals))
@@ -82,34 +77,6 @@ def _with_noise_alone(
     observed = moved(bench.simulator.task.attitudes, readings.observed, simulated * readings.scale)
     drawn = replace(readings, observed=observed)
     return replace(replays, readings=drawn).residuals(point[None])
-
-
-def _nearby_best(
-    replays: FittedReplays, point: Float[np.ndarray, " d"], states: Float[np.ndarray, "windows state"]
-) -> Float[np.ndarray, "points d"]:
-    """The last points of Gauss-Newton steps from an estimate on whole windows of the hold-out.
-
-    Initial states, which begin at those given, are unknowns too. These points have been fitted to the hold-out itself,
-    so none is an estimate: they show what parameters could reach.
-    """
-    simulator, readings = replays.simulator, replays.readings
-    visited, before = list[Float[np.ndarray, " d"]](), 0.0
-    for _ in range(min(NEARBY_STEPS, replays.most_steps)):
-        slopes = slopes_at(simulator, readings, point[None], states[None])[0]
-        if not slopes.whole.any():
-            break
-        scale = scale_of(slopes.residuals[slopes.whole], "cauchy")
-        if abs(scale - before) < GAIN * before:
-            break
-        before = scale
-        z = (slopes.residuals / scale) ** 2
-        newton = slopes.curved(curvature_share(z[slopes.whole], "cauchy"))
-        eliminated = eliminate(newton, loss_slope(z, "cauchy"), DAMPING)
-        step = damped_step(*triangular_factors(eliminated.reduced, 1.0, "linear"), point, DAMPING)
-        states = states + readings.in_state_units(eliminated.states_step(step), states.shape[1])
-        point = point + step
-        visited.append(point)
-    return np.array(visited[-_CANDIDATES:] or [point])
 
 
 def _against_chance(replays: FittedReplays, residuals: Float[np.ndarray, "windows readings channels"]) -> AgainstChance:
