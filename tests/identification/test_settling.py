@@ -62,7 +62,7 @@ def test_the_cost_of_normal_noise():
 def test_a_window_is_unexplained_beyond_three_deviations_of_its_cost():
     limit = 1.0 + 3.0 * np.sqrt(2.0) / 10.0
     costs = np.array([1.0, limit - 1e-6, limit + 1e-6])
-    some = Settled(np.zeros((3, 1)), np.ones(3), np.ones(1), np.ones(1), costs, 0)
+    some = Settled(np.zeros((3, 1)), np.ones(3), np.ones(1), np.ones(1), costs, costs > 2.0, 0)
     assert some.unexplained(100, "linear").tolist() == [False, False, True]
 
 
@@ -107,7 +107,7 @@ def test_new_beginnings_end_once_one_explains_hardly_any_more_windows(monkeypatc
 
     def left(share):
         many = np.where(np.arange(len(readings)) < share * len(readings), high, 0.0)
-        return Settled(guesses, np.ones(len(readings)), np.ones(2), np.ones(2), many, 0)
+        return Settled(guesses, np.ones(len(readings)), np.ones(2), np.ones(2), many, many > 0.0, 0)
 
     monkeypatch.setattr(settling, "settled", lambda *_: left(next(costs)))
     monkeypatch.setattr(settling, "restart", lambda *_: left(next(costs)))

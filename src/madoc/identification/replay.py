@@ -50,7 +50,7 @@ class Readings:
         observed: The observations, from that at the first row on.
         scale: Typical change of each channel in a step, of which residuals are multiples.
         spread: Standard deviation of each value of (qpos, qvel) over the log, of which steps of initial states are
-            multiples. Pending actions are known.
+            multiples; 0 of places in the plane on which nothing depends. Pending actions are known.
     """
 
     actions: Float[np.ndarray, "windows steps action"]
@@ -72,7 +72,7 @@ class Readings:
             actions=np.asarray(dataset.transitions.action)[rows[:, None] + np.arange(steps)],
             observed=readings_at(dataset, rows, steps)[..., : logged.measured],
             scale=scale[: logged.measured],
-            spread=spread_of(logged.states[:, : logged.physical_size]),
+            spread=np.where(logged.in_plane, 0.0, spread_of(logged.states[:, : logged.physical_size])),
         )
 
     def __len__(self) -> int:

@@ -30,6 +30,10 @@ WIDTHS = (3.0, 3.0, 1.5, 0.7, 0.3, 0.1, 0.0, 0.0)
 """Widths of the differences from step to step, in standard errors of the initial states; 0 is `DIFFERENCE`."""
 RESETTLING = (1.0, 0.3, 0.0)
 """The same where initial states are nearly right, as drawn by an ensemble."""
+STEPS = 10
+"""Largest number of steps by narrow differences."""
+GAIN = 0.01
+"""Share in (0, 1] of a window's cost; after a step that saves less its initial state is fitted."""
 ANEW = 2
 """Number of times that windows whose residuals are more than noise begin anew near the guess of their state, in the fit
 for prediction and, after once at the guess itself, in tests of a model."""
@@ -61,6 +65,7 @@ class Settled:
             value over the log; at most 1.
         deviation: Noise of each channel, in its typical changes: what no initial state explains, to first order.
         costs: Mean loss of each window's residuals after the step, in squared standard deviations of the noise.
+        gaining: Windows whose cost the step lowered by more than `GAIN`.
         failures: Windows whose simulation failed before it.
     """
 
@@ -69,6 +74,7 @@ class Settled:
     errors: Float[np.ndarray, " physical"]
     deviation: Float[np.ndarray, " channels"]
     costs: Float[np.ndarray, " windows"]
+    gaining: Bool[np.ndarray, " windows"]
     failures: int
 
     def unexplained(self, values: int, loss: Loss) -> Bool[np.ndarray, " windows"]:
@@ -110,8 +116,33 @@ def settle(
         errors=errors,
         deviation=deviation,
         costs=costs.min(0),
+        gaining=costs.min(0) < (1.0 - GAIN) * costs[-1],
         failures=int((~slopes.whole).sum()),
     )
+
+
+def fitted_states(
+    simulator: Simulator,
+    readings: Readings,
+    point: Float[np.ndarray, " d"],
+    guesses: Float[np.ndarray, "windows state"],
+    loss: Loss,
+    most: int = STEPS,
+) -> Float[np.ndarray, "windows state"]:
+    """Initial states after steps by narrow differences: each step moves the windows that the last one gained on.
+
+    They end after `most` of them, or once hardly any window is left.
+    """
+    states, damping = guesses.copy(), np.full(len(guesses), FIRST_DAMPING)
+    moving, narrow = np.arange(len(guesses)), np.zeros(len(readings.spread))
+    for _ in range(most):
+        part = readings.of(moving)
+        after = settle(simulator, part, point, states[moving], damping[moving], narrow, loss)
+        states[moving], damping[moving] = after.states, after.damping
+        moving = moving[after.gaining]
+        if len(moving) <= FEW * len(readings):
+            break
+    return states
 
 
 def restart(

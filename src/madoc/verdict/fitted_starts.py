@@ -12,8 +12,8 @@ from jaxtyping import Float, Int
 
 from madoc.data import Dataset
 from madoc.identification.ensembles import likely_states
-from madoc.identification.gauss_newton import LEAST_DAMPING, states_steps
-from madoc.identification.replay import Readings, slopes_at
+from madoc.identification.replay import Readings
+from madoc.identification.settling import STEPS, fitted_states
 from madoc.identification.states import LoggedStates, states_of
 from madoc.identification.windows import evenly, rows_that_fit
 from madoc.simulation.base import Simulator
@@ -25,14 +25,6 @@ AHEAD = (1, 5, 10)
 """Numbers of strides after the fitted ones at which errors are taken."""
 MOST = 150
 """Largest number of windows."""
-FIT_STEPS = 10
-"""Largest number of damped Gauss-Newton steps of an initial state, which begins at finite differences."""
-GAIN = 1e-2
-"""Share in (0, 1] of a window's squared residuals; after a step that saves less its initial state is fitted."""
-FEW = 0.01
-"""Share in [0, 1] of the windows, up to which no further step is taken for those that a step gained on."""
-_SHARES = np.array([1.0, 0.3, 0.1])
-"""Shares in (0, 1] of a step, of which every window takes the one that fits it best; none where none does."""
 _POINTS, _NEARBY_STEPS = 5, 6
 """Number of points at which starts are fitted, and of Gauss-Newton steps of the parameters beside them."""
 
@@ -54,7 +46,7 @@ class FittedReplays:
     episodes: Int[np.ndarray, " windows"]
     stride: int
     ahead: tuple[int, ...]
-    most_steps: int = FIT_STEPS
+    most_steps: int = STEPS
 
     @property
     def fitted(self) -> int:
@@ -98,48 +90,20 @@ class FittedReplays:
         """
         whole = self.readings
         first = replace(whole, actions=whole.actions[:, : self.fitted], observed=whole.observed[:, : self.fitted + 1])
-        if near is None or self.most_steps < FIT_STEPS:
+        if near is None or self.most_steps < STEPS:
             log = self.held, self.logged, self.simulator, first, self.rows
             likely = likely_states(*log, points, self.near)
         else:
             likely = np.repeat(near[None], len(points), axis=0)
-        return np.stack([self._fitted(first, *each) for each in zip(points, likely, strict=True)])
-
-    def _fitted(
-        self, first: Readings, point: Float[np.ndarray, " d"], states: Float[np.ndarray, "windows state"]
-    ) -> Float[np.ndarray, "windows state"]:
-        """States from which a system comes nearest to the first readings: each step moves those the last gained on."""
-        states, gaining = states.copy(), np.arange(len(first))
-        for _ in range(self.most_steps):
-            part, around = first.of(gaining), states[gaining]
-            (slopes,) = slopes_at(self.simulator, part, point[None], around[None], parameters=False)
-            damping, alike = np.full((1, len(part)), LEAST_DAMPING), np.ones_like(slopes.residuals)
-            (moved,) = states_steps(slopes, alike, damping)
-            step = first.in_state_units(moved * ~self.logged.in_plane, states.shape[1])
-            tried = around + _SHARES[:, None, None] * step
-            residuals = part.residuals(self.simulator, point[None], tried.reshape(1, -1, states.shape[1]))[0]
-            before = np.where(slopes.whole, (slopes.residuals**2).sum(-1), np.inf)
-            costs = np.concatenate([_squares(residuals), before[None]])
-            best = costs.argmin(0)
-            states[gaining] = np.concatenate([tried, around[None]])[best, np.arange(len(part))]
-            gaining = gaining[costs.min(0) < (1.0 - GAIN) * before]
-            if len(gaining) <= FEW * len(first):
-                break
-        return states
+        pairs = zip(points, likely, strict=True)
+        return np.stack([fitted_states(self.simulator, first, *each, "linear", self.most_steps) for each in pairs])
 
 
 def replay_steps(logged: LoggedStates, stride: int, parameters: int) -> int:
     """About how many control steps a window takes until it is judged: at four points, with noise, and nearby."""
     values, fitted, ahead = logged.physical_size, FITTED * stride, AHEAD[-1] * stride
-    starts = _POINTS * FIT_STEPS * (1 + values + len(_SHARES)) * fitted
+    starts = _POINTS * STEPS * (4 + values) * fitted
     return starts + _NEARBY_STEPS * (1 + 2 * parameters + values) * (fitted + ahead)
-
-
-def _squares(residuals: Float[np.ndarray, "*windows values"]) -> Float[np.ndarray, "*windows"]:
-    """Sums of squares, infinite for a window whose simulation failed."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        cost = (residuals**2).sum(-1)
-    return np.where(np.isfinite(cost), cost, np.inf)
 
 
 def fitted_replays_of(
