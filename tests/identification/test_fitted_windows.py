@@ -63,8 +63,8 @@ def test_where_every_window_fails_the_start_is_kept(windows):
     fit, spent = counted(fit_windows, simulator, readings, np.full_like(states, np.nan), np.zeros(3))
     assert fit.point.tolist() == [0.0, 0.0, 0.0]
     assert not fit.slopes.whole.any()
-    by_states, by_parameters = 1 + 2, 1 + 2 * 3
-    assert spent == (by_states + by_parameters) * len(readings) * readings.steps
+    of_states, by_both = 1 + 2 + 3, 1 + 2 * 3 + 2  # a step of the states with its three dampings, then all derivatives
+    assert spent == (of_states + by_both) * len(readings) * readings.steps
 
 
 def test_slopes_at_another_point_leave_out_windows_that_fail_there():

@@ -11,7 +11,6 @@ from madoc.data.timescale import stride
 from madoc.identification.ensembles import with_contacts_settled
 from madoc.identification.gauss_newton import (
     DAMPING,
-    LEAST_DAMPING,
     Eliminated,
     damped_step,
     eliminate,
@@ -19,14 +18,14 @@ from madoc.identification.gauss_newton import (
     left_by,
     left_by_states,
     spare_of,
-    states_steps,
     triangular_factors,
 )
 from madoc.identification.linearisation import WindowSlopes
-from madoc.identification.losses import TUNING, loss_slope, loss_value, scale_of
+from madoc.identification.losses import TUNING, loss_slope
 from madoc.identification.noise import channel_noise
 from madoc.identification.replay import Readings, slopes_at
 from madoc.identification.score_tests import Products
+from madoc.identification.settling import fitted_states
 from madoc.identification.states import LoggedStates
 from madoc.identification.windows import disjoint_windows, evenly, longest_fit
 from madoc.simulation.base import Simulator
@@ -42,7 +41,7 @@ far more than noise: it adds up over a window and hides itself then, and noise h
 NEGLIGIBLE = 1e-5
 """Residual in typical changes of a stride; below it there is nothing to explain."""
 LINEARISATIONS = 4
-"""Largest number of times that derivatives are simulated in a fit of parameters, and again in one of initial states."""
+"""Largest number of times that derivatives are simulated anew in a fit."""
 STEPS = 4
 """Largest number of Gauss-Newton steps with the same derivatives."""
 GAIN = 0.01
@@ -178,22 +177,19 @@ def fit_windows(
 
     Steps are those of a robust loss, and are taken while they lower the median window's squared residual.
 
-    Initial states are fitted alone before, as logged ones are noisy and their slopes are the cheaper ones, and once
-    more at the parameters found, so that outlying readings count little.
+    Initial states are fitted alone before, as logged ones are noisy and their slopes are the cheaper ones.
     """
-    unknown = np.zeros((len(readings), readings.observed[0].size, len(point)))
-    fit = _settled(simulator, readings, _sloped(simulator, readings, states, point, by_parameters=unknown))
-    fit = _sloped_by_parameters(simulator, readings, fit)
+    states = fitted_states(simulator, readings, point, states, "cauchy")
+    fit = _sloped(simulator, readings, states, point)
     for _ in range(LINEARISATIONS):
-        moved = _descended(simulator, readings, fit)
-        if not moved.gains_on(fit):
+        moved, before = _descended(simulator, readings, fit), fit
+        if moved is fit:
             break
         fresh = _sloped(simulator, readings, moved.states, moved.point)
-        if not fresh.gains_on(fit):
+        fit = min(fit, fresh, key=lambda each: each.unexplained)
+        if not fit.gains_on(before):
             break
-        fit = fresh
-    settled = _settled(simulator, readings, fit)
-    return settled if settled.explicable is fit.explicable else _sloped_by_parameters(simulator, readings, settled)
+    return fit
 
 
 def _sloped(
@@ -201,48 +197,31 @@ def _sloped(
     readings: Readings,
     states: Float[np.ndarray, "windows state"],
     point: Float[np.ndarray, " d"],
-    *,
-    by_parameters: Float[np.ndarray, "windows values d"] | None = None,
 ) -> Fit:
-    """Residuals and their derivatives simulated at a point.
-
-    Derivatives by parameters are not simulated where they are given.
-    """
-    (slopes,) = slopes_at(simulator, readings, point[None], states[None], parameters=by_parameters is None)
-    if by_parameters is not None:
-        slopes = replace(slopes, by_parameters=np.where(slopes.whole[:, None, None], by_parameters, 0.0))
+    """Residuals and their derivatives simulated at a point."""
+    (slopes,) = slopes_at(simulator, readings, point[None], states[None])
     return Fit(point, states, slopes, explicable(slopes), slopes.whole)
 
 
-def _sloped_by_parameters(simulator: Simulator, readings: Readings, fit: Fit) -> Fit:
-    """The fit with derivatives by parameters simulated anew; windows that fail there are left out."""
-    (slopes,) = slopes_at(simulator, readings, fit.point[None], fit.states[None], initial_states=False)
-    residuals = np.where(slopes.whole[:, None], fit.slopes.residuals, np.nan)
-    both = replace(fit.slopes, by_parameters=slopes.by_parameters).at(residuals)
-    return replace(fit, slopes=both, counted=fit.counted & slopes.whole)
-
-
 def _descended(simulator: Simulator, readings: Readings, fit: Fit) -> Fit:
-    """The fit after Gauss-Newton steps for as long as each gains, all with the derivatives given.
+    """The fit after Gauss-Newton steps for as long as each gains much, all with the derivatives given.
 
     Derivatives take 1 + 2 d + n simulations of every window, a step takes one for each of `LENGTHS`.
     """
     for _ in range(STEPS):
         if not fit.slopes.whole.any():
             break
-        moved = _stepped(simulator, readings, fit)
-        if not moved.gains_on(fit):
+        before, fit = fit, _stepped(simulator, readings, fit)
+        if not fit.gains_on(before):
             break
-        fit = moved
     return fit
 
 
 def _stepped(simulator: Simulator, readings: Readings, fit: Fit) -> Fit:
     """The fit after a Gauss-Newton step of the length that gains most; the same point where none gains."""
     slopes = fit.slopes
-    scale = scale_of(slopes.residuals[slopes.whole], "cauchy")
-    weights = loss_slope((slopes.residuals / scale) ** 2, "cauchy") * slopes.whole[:, None]
-    left = eliminate(slopes, weights)
+    scaled = slopes.over(_noise(fit.left, fit.spare, slopes.whole, readings))
+    left = eliminate(scaled, _weights(scaled))
     whole_step = damped_step(*triangular_factors(left.reduced, 1.0, "linear"), fit.point, DAMPING)
     of_states = readings.in_state_units(left.states_step(whole_step), fit.states.shape[1])
     points = fit.point + LENGTHS[:, None] * whole_step
@@ -253,39 +232,6 @@ def _stepped(simulator: Simulator, readings: Readings, fit: Fit) -> Fit:
         for point, state, residual in zip(points, states, residuals, strict=True)
     ]
     return min([fit, *tried], key=lambda each: each.unexplained)
-
-
-def _settled(simulator: Simulator, readings: Readings, fit: Fit) -> Fit:
-    """The fit with fitted initial states, by whose derivatives are simulated anew for as long as that changes it."""
-    for _ in range(LINEARISATIONS):
-        before = fit.unexplained
-        fit = _with_fitted_states(simulator, readings, fit)
-        # Steps of the states change what they cannot explain only where their slopes do not hold.
-        if not abs(fit.unexplained - before) > GAIN * before:
-            break
-        kept = fit.slopes.by_parameters
-        fit = _sloped(simulator, readings, fit.states, fit.point, by_parameters=kept)
-    return fit
-
-
-def _with_fitted_states(simulator: Simulator, readings: Readings, fit: Fit) -> Fit:
-    """The fit with the initial states that explain each window best; outlying readings count little."""
-    for _ in range(STEPS):
-        slopes, states = fit.slopes, fit.states
-        if not slopes.whole.any():
-            break
-        noise = _noise(fit.left, fit.spare, slopes.whole, readings)
-        scaled, damping = slopes.over(noise), np.full((1, len(states)), LEAST_DAMPING)
-        (step,) = states_steps(scaled, _weights(scaled), damping)
-        moved = states + readings.in_state_units(step, states.shape[1])
-        after = readings.residuals(simulator, fit.point[None], moved[None])[0, 0]
-        before, now = _costs(scaled.residuals), _costs(after / noise)
-        better = slopes.whole & (now < before)
-        kept = replace(slopes, residuals=np.where(better[:, None], after, slopes.residuals))
-        fit = replace(fit, states=np.where(better[:, None], moved, states), slopes=kept)
-        if before[better].sum() - now[better].sum() <= GAIN * before[slopes.whole].sum():
-            break
-    return fit
 
 
 @dataclass(frozen=True)
@@ -360,10 +306,3 @@ def _noise(
 def _weights(slopes: WindowSlopes) -> Float[np.ndarray, "windows values"]:
     """Weights of residuals in units of the noise, by Cauchy's loss."""
     return loss_slope((slopes.residuals / TUNING["cauchy"]) ** 2, "cauchy") * slopes.whole[:, None]
-
-
-def _costs(residuals: Float[np.ndarray, "windows values"]) -> Float[np.ndarray, " windows"]:
-    """Mean loss of each window's residuals in units of the noise; infinite where its simulation failed."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        cost = loss_value((residuals / TUNING["cauchy"]) ** 2, "cauchy").mean(-1)
-    return np.where(np.isfinite(cost), cost, np.inf)
