@@ -165,9 +165,12 @@ def better_than_chance(
 def beyond_noise(
     errors: Sequence[PredictionError], noise: Iterable[PredictionError]
 ) -> list[tuple[PredictionError, PredictionError]]:
-    """The errors that noise does not explain, each with the error of noise alone."""
+    """The errors that noise does not explain, each with the error of noise alone.
+
+    It is the lower end of an error's interval that counts: the mean of a few windows may be as large by chance.
+    """
     pairs = zip(errors, noise, strict=True)
-    return [(left, alone) for left, alone in pairs if left.mean > max(NEGLIGIBLE, ABOVE_NOISE * alone.mean)]
+    return [(left, alone) for left, alone in pairs if left.interval[0] > max(NEGLIGIBLE, ABOVE_NOISE * alone.mean)]
 
 
 def beside_random(
