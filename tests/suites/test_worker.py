@@ -9,7 +9,7 @@ import pytest
 from madoc.errors import MadocError, NotAllowed
 from madoc.pipeline.orders import Permission
 from madoc.runs.checkpoint import OtherState
-from madoc.suites import process, stages
+from madoc.suites import process, worker
 from madoc.suites.cells import Cell, write_plan
 from madoc.suites.claims import MOST_ATTEMPTS, attempts_of, claimed, outcome_of, try_again
 from madoc.suites.planning import plan_of
@@ -44,10 +44,10 @@ def test_a_policy_is_evaluated_with_its_calibration(place, monkeypatch):
     policy = Cell("policy", "learn", {"method": "sac"}, "calibration")
     evaluation = Cell("evaluation", "evaluate", {"episodes": 3}, "policy")
     write_plan(out, "suite", [Cell("calibration", "calibrate", {}), policy, evaluation])
-    monkeypatch.setattr(stages, "_require_unchanged", lambda *asked, **options: None)
-    monkeypatch.setattr(stages, "evaluate_folder", lambda *places, **told: asked.append((places[0], told)) or places[1])
+    monkeypatch.setattr(worker, "_require_unchanged", lambda *asked, **options: None)
+    monkeypatch.setattr(worker, "evaluate_folder", lambda *places, **told: asked.append((places[0], told)) or places[1])
     with claimed(evaluation, out) as claim:
-        assert stages.carry_out(claim, out).status == "finished"
+        assert worker.carry_out(claim, out).status == "finished"
     ((folder, told),) = asked
     assert (folder, told["calibration"]) == (policy.folder(out), out / "cells" / "calibration")
 
@@ -98,7 +98,7 @@ def test_a_checkpoint_of_another_version_is_no_refusal(planned, monkeypatch, err
     def calibrate_in(*arguments, **options):
         raise error("a sentence")
 
-    monkeypatch.setattr(stages, "calibrate_in", calibrate_in)
+    monkeypatch.setattr(worker, "calibrate_in", calibrate_in)
     assert [outcome.status for outcome in work(out)] == [status]
     assert outcome_of(cell, out).sentence == "a sentence"
 
@@ -156,14 +156,14 @@ def test_a_cell_that_ends_its_processes_comes_after_the_others(planned):
 
 def test_an_error_that_is_no_refusal_is_told_and_stops_nobody(planned, monkeypatch):
     out, cells = planned(CELL + "    grid: {seed: 0..1}\n")
-    whole = stages.calibrate_in
+    whole = worker.calibrate_in
 
     def broken(folder, order, **options):
         if order.search.seed == 0:
             raise ZeroDivisionError("division by zero")
         return whole(folder, order, **options)
 
-    monkeypatch.setattr(stages, "calibrate_in", broken)
+    monkeypatch.setattr(worker, "calibrate_in", broken)
     assert [outcome.status for outcome in work(out)] == ["failed", "finished"]
     assert "ZeroDivisionError: division by zero" in outcome_of(cells[0], out).sentence
     assert "Traceback" in (cells[0].folder(out) / "failure.txt").read_text()
