@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 
 from affine import layered
-from madoc.learning import cql_losses, h2o_losses, sac_losses, tanh_gaussian
+from madoc.learning import sac_losses, tanh_gaussian
 from madoc.learning.sac_losses import TwinCritic
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
+from madoc.policies import cql, h2o
 
 ELSEWHERE = {
     "soft_target": [0.1492636, -0.265457, -0.9878966, -1.243325, -0.03467786, 0.8268372],
@@ -114,13 +115,13 @@ def test_sac(draws):
 
 def test_cql(draws, monkeypatch):
     drawn = [jnp.stack([rows(start, 6, 2), rows(start + 20, 6, 2)]) for start in (300, 400, 500)]
-    monkeypatch.setattr(cql_losses.jax.random, "uniform", lambda key, shape, minval, maxval: drawn[0].reshape(shape))
+    monkeypatch.setattr(cql.jax.random, "uniform", lambda key, shape, minval, maxval: drawn[0].reshape(shape))
     draws(drawn[1:])
-    proposed = cql_losses.proposals(POLICY, OBSERVATION, FOLLOWING, samples=2, key=jax.random.key(0))
+    proposed = cql.proposals(POLICY, OBSERVATION, FOLLOWING, samples=2, key=jax.random.key(0))
     hard = jnp.array(ELSEWHERE["hard_target"])
 
     def loss_of(critic):
-        return cql_losses.cql_loss(critic, OBSERVATION, ACTION, hard, proposed, weight=5.0)
+        return cql.cql_loss(critic, OBSERVATION, ACTION, hard, proposed, weight=5.0)
 
     loss, *slopes = loss_and_slopes(lambda critic: loss_of(critic)[0], CRITIC, critic_weights)
     close([loss, loss_of(CRITIC)[1], *slopes], "cql")
@@ -132,7 +133,7 @@ def test_h2o():
     settings = {"ratio": jnp.array([0.2, 1.0, 1e-5]), "gap": jnp.array([0.5, 0.01, 2.0]), "weight": 0.01}
 
     def loss_of(critic):
-        return h2o_losses.h2o_loss(critic, real, simulated, **settings)
+        return h2o.h2o_loss(critic, real, simulated, **settings)
 
     loss, *slopes = loss_and_slopes(lambda critic: loss_of(critic)[0], CRITIC, critic_weights)
     close([loss, loss_of(CRITIC)[1], *slopes], "h2o")
@@ -141,4 +142,4 @@ def test_h2o():
 def test_h2o_dynamics_ratio():
     """From the two-class logits f_sa and f_sas, whose softmaxes the other implementation divides."""
     logits = rows(650, 3, 2)
-    close(h2o_losses.dynamics_ratio(logits[:, 0] - logits[:, 1]), "ratio_clipped")
+    close(h2o.dynamics_ratio(logits[:, 0] - logits[:, 1]), "ratio_clipped")

@@ -8,9 +8,9 @@ import pytest
 from scipy import integrate
 
 from affine import affine, layered
-from madoc.learning.cql_losses import conservative_gap, cql_loss, log_integral, proposals
 from madoc.learning.sac_losses import TwinCritic
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy, log_density
+from madoc.policies.cql import conservative_gap, cql_loss, log_integral, proposals
 
 
 def twins(first, second):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from madoc.learning.moments import Moments
+from madoc.policies.interaction import Moments
 
 
 def test_batches_add_up_to_all_rows():

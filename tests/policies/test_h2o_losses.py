@@ -6,8 +6,8 @@ import pytest
 
 from affine import affine
 from madoc.learning.dynamics_ratio import Discriminators, log_dynamics_ratio
-from madoc.learning.h2o_losses import dynamics_gap, dynamics_ratio, gap_weighted_value, h2o_loss
 from madoc.learning.sac_losses import TwinCritic
+from madoc.policies.h2o import dynamics_gap, dynamics_ratio, gap_weighted_value, h2o_loss
 
 
 def column(numbers):
