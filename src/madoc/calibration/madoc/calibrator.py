@@ -20,7 +20,7 @@ from madoc.calibration.madoc import grouping, watch
 from madoc.calibration.madoc.actors import draw_parameters, squashed
 from madoc.calibration.madoc.agents import AgentSettings
 from madoc.calibration.madoc.collection import Collection, geometry
-from madoc.calibration.madoc.grouping import Grouping, Votes
+from madoc.calibration.madoc.grouping import Grouping, GroupingVAE, Votes
 from madoc.calibration.madoc.state import MadocState
 from madoc.calibration.madoc.value_decomposition import Mixing
 from madoc.calibration.sensing import SensorNoise, noise_deviation, rows_compared
@@ -28,7 +28,6 @@ from madoc.errors import MadocError
 from madoc.learning import replay
 from madoc.learning.cloning import cloning_epoch, fresh_clone
 from madoc.learning.expectation import Expectation, fresh_expectation, learn_expectation, noise_of_log
-from madoc.learning.grouping_vae import GroupingVAE
 from madoc.learning.networks import scalars
 from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, check_hyperparameters
 

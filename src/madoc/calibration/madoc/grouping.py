@@ -1,24 +1,87 @@
-"""Groups of parameters with similar effects: k-means of a VAE's embeddings, and a vote over epochs."""
+"""Groups of parameters with similar effects: k-means of a VAE's embeddings, and a vote over epochs.
+
+The VAE embeds parameters by their effects on simulated motion: Eq. (10) of Jiang et al. 2024.
+"""
 
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
+import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from madoc.learning import replay
-from madoc.learning.grouping_vae import GroupingVAE, train
-from madoc.learning.networks import adam
+from madoc.learning.networks import Network, Observations, Scalar, adam, minimise
 
 Grouping = Literal["each", "learned", "one"]
 VOTING = 0.05
 """Share in [0, 1] of the epochs of grouping, the last ones, in which the VAE's groups are voted on; the authors'."""
 VOTES = 10
 """Number of votes in each of these epochs: the authors take about 9, at random, in 1000 updates."""
+LATENT = 16
+"""Width of the embedding, and number of repetitions of the parameter's value beside it (appendix C)."""
 PROJECTED = 3
 """Number of principal components in which the embeddings are clustered."""
+
+
+class GroupingVAE(eqx.Module):
+    """Encoder: identity -> embedding. Decoder: (s, a, ξ_i, embedding) -> s' - s.
+
+    Eq. (10) without its KL term, as the paper trains it (appendix C): nothing is generated from the embedding, which
+    only has to distinguish parameters, so it is the encoder's mean. The paper writes s'; the authors' code predicts the
+    change, as this does, in which the parameter's effect does not vanish beside the state.
+    """
+
+    encoder: Network
+    decoder: Network
+
+    def __init__(
+        self, parameters: int, pair: int, observation: int, hidden: tuple[int, ...], *, key: PRNGKeyArray
+    ) -> None:
+        of_encoder, of_decoder = jax.random.split(key)
+        self.encoder = Network(parameters, LATENT, hidden, key=of_encoder)
+        self.decoder = Network(pair + 2 * LATENT, observation, hidden, key=of_decoder)
+
+    def embeddings(self) -> Float[Array, "d latent"]:
+        """The embedding of each parameter."""
+        return self.encoder(jnp.eye(int(self.encoder.layers[0].in_features)))
+
+    def __call__(self, pair: Array, value: Array, identity: Array) -> Observations:
+        """The predicted features of s' - s, given the value (in [-1, 1]) of the varied parameter, and its index."""
+        repeated = jnp.repeat(value[:, None], LATENT, axis=1)
+        return self.decoder(jnp.concatenate([pair, repeated, self.embeddings()[identity]], axis=-1))
+
+
+def reconstruction_loss(
+    vae: GroupingVAE, pair: Array, change: Array, value: Array, identity: Int[Array, " rows"]
+) -> Scalar:
+    """The first term of Eq. (10) with a unit-variance decoder: mean squared error of s' - s."""
+    return jnp.mean((vae(pair, value, identity) - change) ** 2)
+
+
+@eqx.filter_jit
+def train(
+    vae: GroupingVAE,
+    optimiser_state: PyTree,
+    rows: replay.Replay,
+    key: PRNGKeyArray,
+    *,
+    optimiser: optax.GradientTransformation,
+    batch: int,
+    count: int,
+) -> tuple[GroupingVAE, PyTree, Scalar]:
+    """`count` updates on simulated rows, whose s' is described by s' - s; also the mean loss."""
+
+    def loss_of(vae: GroupingVAE, key: PRNGKeyArray) -> Scalar:
+        drawn = replay.sample(rows, key, batch)
+        identity = drawn["identity"].astype(jnp.int32)
+        value = jnp.take_along_axis(drawn["parameters"], identity[:, None], axis=1)[:, 0]
+        return reconstruction_loss(vae, drawn["pair"], drawn["following"], value, identity)
+
+    return minimise(loss_of, vae, optimiser_state, key, optimiser=optimiser, count=count)
 
 
 @jax.tree_util.register_dataclass

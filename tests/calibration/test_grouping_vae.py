@@ -7,8 +7,8 @@ import pytest
 
 from affine import affine
 from madoc.calibration.madoc import grouping
-from madoc.learning import grouping_vae, replay
-from madoc.learning.grouping_vae import LATENT, GroupingVAE
+from madoc.calibration.madoc.grouping import LATENT, GroupingVAE
+from madoc.learning import replay
 
 OPTIMISER = optax.adam(3e-3)
 
@@ -37,7 +37,7 @@ def simulated_rows(affects, count=4000, seed=0):
 @pytest.mark.parametrize("affects", [(0, 0, 1, 1), (0, 1, 0, 1), (1, 0, 0, 0)])
 def test_parameters_of_one_effect_become_one_group(affects):
     vae, state = untrained()
-    vae, _, _ = grouping_vae.train(
+    vae, _, _ = grouping.train(
         vae, state, simulated_rows(affects), jax.random.key(1), optimiser=OPTIMISER, batch=256, count=800
     )
     expected = [0 if channel == affects[0] else 1 for channel in affects]
@@ -49,10 +49,10 @@ def test_training_lowers_the_loss_and_traces_once(traced):
     rows = simulated_rows((0, 0, 1, 1), count=500)
     settings = {"optimiser": OPTIMISER, "batch": 64, "count": 20}
     keys = list(jax.random.split(jax.random.key(1), 11))
-    vae, state, first = grouping_vae.train(vae, state, rows, keys[0], **settings)
+    vae, state, first = grouping.train(vae, state, rows, keys[0], **settings)
     before = traced()
     for key in keys[1:]:
-        vae, state, last = grouping_vae.train(vae, state, rows, key, **settings)
+        vae, state, last = grouping.train(vae, state, rows, key, **settings)
     assert traced() == before
     assert last < 0.8 * first
     assert state[0].count == 220
@@ -72,7 +72,7 @@ def test_reconstruction_loss_by_hand(compiled):
     pair, value, identity = jnp.array([[1.0], [0.0]]), jnp.array([0.3, -0.2]), jnp.array([0, 1])
     np.testing.assert_allclose(hand_made()(pair, value, identity), [[2.9], [-1.1]], rtol=1e-5)
     # against (2.4, -1): mean(0.5², 0.1²) = 0.13
-    loss = compiled(grouping_vae.reconstruction_loss)(hand_made(), pair, jnp.array([[2.4], [-1.0]]), value, identity)
+    loss = compiled(grouping.reconstruction_loss)(hand_made(), pair, jnp.array([[2.4], [-1.0]]), value, identity)
     assert loss == pytest.approx(0.13, rel=1e-4)
 
 
@@ -91,6 +91,6 @@ def test_training_shows_the_value_of_the_moved_parameter_alone():
     other = replay.Replay(rows.rows | {"parameters": garbled}, rows.written)
     vae, state = untrained(hidden=(8,))
     settings = {"optimiser": OPTIMISER, "batch": 32, "count": 5}
-    trained, _, _ = grouping_vae.train(vae, state, rows, jax.random.key(0), **settings)
-    same, _, _ = grouping_vae.train(vae, state, other, jax.random.key(0), **settings)
+    trained, _, _ = grouping.train(vae, state, rows, jax.random.key(0), **settings)
+    same, _, _ = grouping.train(vae, state, other, jax.random.key(0), **settings)
     jax.tree.map(np.testing.assert_array_equal, trained, same)
