@@ -6,8 +6,9 @@ import pytest
 from scipy import stats
 
 from madoc.calibration.baselines.droid import trajectory_cost
-from madoc.calibration.baselines.dropo.calibrator import DEVIATIONS, distribution_of
-from madoc.calibration.baselines.dropo.likelihood import (
+from madoc.calibration.baselines.dropo import (
+    DEVIATIONS,
+    distribution_of,
     entropy,
     moments,
     negative_log_likelihood,

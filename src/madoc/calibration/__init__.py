@@ -5,7 +5,7 @@ from madoc.calibration.base import Calibrator as Calibrator
 from madoc.calibration.base import Estimate as Estimate
 from madoc.calibration.baselines.cma_es.calibrator import CmaEs as CmaEs
 from madoc.calibration.baselines.droid import Droid as Droid
-from madoc.calibration.baselines.dropo.calibrator import Dropo as Dropo
+from madoc.calibration.baselines.dropo import Dropo as Dropo
 from madoc.calibration.baselines.npe.calibrator import Npe as Npe
 from madoc.calibration.baselines.oted.calibrator import Oted as Oted
 from madoc.calibration.baselines.uncalibrated import Uncalibrated as Uncalibrated

@@ -6,7 +6,7 @@ from typing import Any
 from madoc.calibration.base import Calibrator
 from madoc.calibration.baselines.cma_es.calibrator import CmaEs
 from madoc.calibration.baselines.droid import Droid
-from madoc.calibration.baselines.dropo.calibrator import ENTROPY_WEIGHT, Dropo
+from madoc.calibration.baselines.dropo import ENTROPY_WEIGHT, Dropo
 from madoc.calibration.baselines.npe.calibrator import Npe
 from madoc.calibration.baselines.oted.calibrator import Oted
 from madoc.calibration.baselines.uncalibrated import Uncalibrated

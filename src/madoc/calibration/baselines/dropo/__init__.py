@@ -1,1 +1,0 @@
-"""DROPO and E-DROPO: the distribution of parameters under which the logged next states are likely."""
