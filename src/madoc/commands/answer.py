@@ -1,9 +1,9 @@
 """What a command returns and prints, and the options that all commands share."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING
 
 from rich.console import RenderableType
 from rich.table import Table
@@ -58,18 +58,12 @@ class Output:
     """Print exactly one JSON object on standard output."""
 
 
-@runtime_checkable
-class Command(Protocol):
-    """A command with its options."""
-
-    @property
-    def output(self) -> Output:
-        """What it prints."""
-        ...
-
-    def run(self) -> Answer:
-        """Carry the command out."""
-        ...
+def table_of(title: str, words: Sequence[str], numbers: Sequence[str] = ()) -> Table:
+    """A table with headings of columns of words, and after them of columns of numbers."""
+    table = Table(*words, title=title, title_justify="left")
+    for heading in numbers:
+        table.add_column(heading, justify="right")
+    return table
 
 
 def evaluation_text(evaluation: "EvaluationRecord") -> tuple[RenderableType, ...]:
@@ -89,10 +83,7 @@ def evaluation_text(evaluation: "EvaluationRecord") -> tuple[RenderableType, ...
 def _target_table(evaluation: "EvaluationRecord") -> Table:
     """Returns in the target, a row for each policy."""
     title = f"{evaluation.task}: returns in the target, {evaluation.episodes} episodes"
-    table = Table(title=title, title_justify="left")
-    table.add_column("policy learnt")
-    for heading in ("return ± std", "normalized", "length"):
-        table.add_column(heading, justify="right")
+    table = table_of(title, ["policy learnt"], ("return ± std", "normalized", "length"))
     for name, row in evaluation.policies.items():
         table.add_row(
             PLACE_NAMES.get(name, name),
@@ -107,10 +98,7 @@ def _estimate_table(evaluation: "EvaluationRecord") -> Table:
     """Returns at the estimate and over draws of it, a row for each policy."""
     draws = next(iter(evaluation.over_draws.values())).draws
     title = f"{evaluation.task}: returns in the calibrated simulator"
-    table = Table(title=title, title_justify="left")
-    table.add_column("policy learnt")
-    for heading in ("at the estimate", f"mean of {draws} draws", "worst tenth"):
-        table.add_column(heading, justify="right")
+    table = table_of(title, ["policy learnt"], ("at the estimate", f"mean of {draws} draws", "worst tenth"))
     for name, drawn in evaluation.over_draws.items():
         cells = (drawn.at_estimate, drawn.mean, drawn.worst_tenth)
         table.add_row(PLACE_NAMES.get(name, name), *(f"{value:,.1f}" for value in cells))
@@ -119,10 +107,8 @@ def _estimate_table(evaluation: "EvaluationRecord") -> Table:
 
 def _costs_table(name: str, costs: "Mapping[str, ErrorCost]") -> Table:
     """What an error of half an interval of each parameter costs a policy, the dearest first."""
-    table = Table(title=f"policy {name}: return lost where one parameter is off", title_justify="left")
-    table.add_column("parameter")
-    for heading in ("off by", "if lower ± std error", "if higher ± std error"):
-        table.add_column(heading, justify="right")
+    title = f"policy {name}: return lost where one parameter is off"
+    table = table_of(title, ["parameter"], ("off by", "if lower ± std error", "if higher ± std error"))
     for parameter, cost in sorted(costs.items(), key=lambda item: -item[1].largest):
         table.add_row(
             parameter,

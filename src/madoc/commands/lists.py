@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, get_args
 from rich.table import Table
 from tyro.conf import OmitArgPrefixes
 
-from madoc.commands.answer import Answer, Output
+from madoc.commands.answer import Answer, Output, table_of
 from madoc.pipeline.orders import Physics
 
 if TYPE_CHECKING:
@@ -28,9 +28,7 @@ class Tasks:
         from madoc.tasks import TASKS, make
 
         tasks = [make(name) for name in TASKS]
-        table = Table("name", title="robots", title_justify="left")
-        for heading in ("observations", "motors", "parameters"):
-            table.add_column(heading, justify="right")
+        table = table_of("robots", ["name"], ("observations", "motors", "parameters"))
         table.add_column("physics")
         for task in tasks:
             counts = (task.observation_size, task.action_size, len(task.parameters))
@@ -65,7 +63,7 @@ def _methods_table(kind: str, entries: "Mapping[str, MethodEntry[Any]]") -> Tabl
     units = {entry.unit for entry in entries.values()}
     columns = ["summary", "paper", "year", *(["unit"] if len(units) > 1 else [])]
     ending = "" if len(units) > 1 else f", budgets in {units.pop()}"
-    table = Table(title=f"{kind}s{ending}", title_justify="left")
+    table = table_of(f"{kind}s{ending}", ())
     for column in ["name", *columns]:
         heading = "budget" if column == "unit" else column
         table.add_column(heading, no_wrap=column in ("name", "year", "unit"))
@@ -96,9 +94,7 @@ def _described(task: "Task") -> dict[str, object]:
 
 def _parameter_table(task: "Task") -> Table:
     """The parameters of one robot, with their ranges at every level."""
-    table = Table("parameter", "unit", title=task.name, title_justify="left")
-    for level in task.ranges:
-        table.add_column(level, justify="right")
+    table = table_of(task.name, ("parameter", "unit"), list(task.ranges))
     for index, parameter in enumerate(task.parameters.parameters):
         rows = [space.parameters[index] for space in task.ranges.values()]
         table.add_row(parameter.name, parameter.unit, *(f"[{row.low:g}, {row.high:g}]" for row in rows))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from rich.table import Table
 from tyro.conf import OmitArgPrefixes, arg
 
-from madoc.commands.answer import Answer, Output
+from madoc.commands.answer import Answer, Output, table_of
 from madoc.errors import MadocError
 from madoc.pipeline.orders import CheckOrder, Permission, RecordOrder, SelftestOrder
 
@@ -117,11 +117,8 @@ class Selftest:
 
 def _table(outcome: "Outcome", task: str) -> Table:
     """One row for each parameter and planted truth."""
-    table = Table(title=f"{outcome.method} on {task}, planted truths", title_justify="left")
-    for heading in ("parameter", "unit"):
-        table.add_column(heading)
-    for heading in ("truth", "planted", "found", "95 %", "covered", "off, % of range"):
-        table.add_column(heading, justify="right")
+    numbers = ("truth", "planted", "found", "95 %", "covered", "off, % of range")
+    table = table_of(f"{outcome.method} on {task}, planted truths", ("parameter", "unit"), numbers)
     for row in outcome.rows:
         interval = "" if row.interval is None else f"[{row.interval[0]:.4g}, {row.interval[1]:.4g}]"
         covered = "" if row.covered is None else ("yes" if row.covered else "no")

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 import tyro
 
 from madoc import __version__
-from madoc.commands.answer import EXIT_CODES, Answer, Command
+from madoc.commands.answer import EXIT_CODES, Answer
 from madoc.commands.lists import Methods, Tasks
 from madoc.commands.logs import Check, Record, Selftest
 from madoc.commands.results import Export, Report, View
@@ -85,7 +85,7 @@ def _refused(sentence: str) -> int:
     return EXIT_CODES["rejected"]
 
 
-def _parse(arguments: Sequence[str]) -> Command:
+def _parse(arguments: Sequence[str]) -> Commands:
     """The command and its options.
 
     Raises:
