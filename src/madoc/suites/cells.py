@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -56,10 +56,6 @@ class Cell:
         """Its run folder inside the folder of a suite."""
         return suite / "cells" / self.name
 
-    def to_json(self) -> dict[str, object]:
-        """All fields."""
-        return {row: getattr(self, row) for row in Cell.__slots__}
-
 
 def hashed(*parts: object) -> str:
     """The name of what is asked: 16 digits that change with anything in it."""
@@ -80,7 +76,7 @@ def write_plan(suite: Path, name: str, cells: Iterable[Cell]) -> None:
         raise MadocError(f"could not make the folder {file.parent}: {error.strerror or error}") from error
     with replacing(file) as stream:
         for cell in cells:
-            stream.write(json.dumps(cell.to_json(), ensure_ascii=False).encode() + b"\n")
+            stream.write(json.dumps(asdict(cell), ensure_ascii=False).encode() + b"\n")
 
 
 def read_plans(suite: Path, name: str | None = None) -> list[Cell]:

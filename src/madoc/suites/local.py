@@ -3,8 +3,7 @@
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing
 from pathlib import Path
 
 from madoc.errors import MadocError
@@ -49,7 +48,7 @@ def run_locally(
     with (
         interruptible() as interruption,
         display(suite.name, unit="cells", quiet=quiet) as show,
-        _crew(suite, plan, min(workers, len(standing.runnable)), permission=permission) as crew,
+        closing(Crew(suite, plan, min(workers, len(standing.runnable)), permission=permission)) as crew,
     ):
         while standing.runnable:
             show(standing.moment())
@@ -100,7 +99,7 @@ class Crew:
         for process in self._processes.values():
             process.wait()
 
-    def kill(self) -> None:
+    def close(self) -> None:
         """End all at once, if they have not ended."""
         for process in self._processes.values():
             process.kill()
@@ -126,13 +125,3 @@ class Crew:
     def _last_words(self, number: int) -> str:
         lines = (self._logs / f"worker-{number}.log").read_text(errors="replace").strip().splitlines()
         return lines[-1].removeprefix("madoc: ") if lines else "nothing"
-
-
-@contextmanager
-def _crew(suite: Path, plan: str, workers: int, *, permission: Permission) -> Iterator[Crew]:
-    """Workers for a block; none is left after it."""
-    crew = Crew(suite, plan, workers, permission=permission)
-    try:
-        yield crew
-    finally:
-        crew.kill()

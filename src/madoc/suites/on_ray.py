@@ -21,7 +21,6 @@ from madoc.pipeline.orders import NO_PERMISSION, Permission
 from madoc.runs.interruption import interruptible
 from madoc.runs.machine import usable_cores
 from madoc.runs.progress import display
-from madoc.suites.cells import Cell
 from madoc.suites.claims import MOST_ATTEMPTS
 from madoc.suites.standing import Standing
 
@@ -118,7 +117,7 @@ class _Tasks:
     def keep_up(self, standing: Standing) -> None:
         """Give Ray every cell that can start, and again one whose task ended without an end of the cell."""
         for cell in standing.runnable:
-            if cell.name not in self._given and _can_start(cell, standing):
+            if cell.name not in self._given and (cell.needs is None or cell.needs in standing.ended):
                 self._given[cell.name] = self._do.remote(self._suite, cell.name, self._plan, self._permission)
         if not self._given:
             time.sleep(_LOOK)
@@ -141,11 +140,6 @@ class _Tasks:
         """Take back every task."""
         for reference in self._given.values():
             self._ray.cancel(reference, force=True)
-
-
-def _can_start(cell: Cell, standing: Standing) -> bool:
-    """Whether what a cell needs is there."""
-    return cell.needs is None or cell.needs in standing.ended
 
 
 @contextmanager

@@ -142,7 +142,7 @@ class _Planner:
         located = dict(given)
         if isinstance(located.get("truth"), str):
             located["truth"] = self._absolute(located["truth"])
-        if isinstance(task := located.get("task"), str) and task not in TASKS and self._is_there(task):
+        if isinstance(task := located.get("task"), str) and task not in TASKS and _located(self.folder, task):
             located["task"] = self._absolute(task)
         if not recorded and "data" in located:
             paths = [located["data"]] if isinstance(located["data"], str) else located["data"]
@@ -151,9 +151,6 @@ class _Planner:
                     _located(self.folder, path) or path if path and isinstance(path, str) else path for path in paths
                 ]
         return located
-
-    def _is_there(self, path: str) -> bool:
-        return _located(self.folder, path) is not None
 
     def _absolute(self, path: str) -> str:
         return _located(self.folder, path) or str(self.folder / path)
