@@ -11,8 +11,7 @@ import pytest
 from madoc import robots, simulation
 from madoc.errors import MadocError
 from madoc.robots.init import write_spec
-from madoc.robots.proposals import MOST
-from madoc.robots.recipes import RECIPES
+from madoc.robots.proposals import MOST, RECIPES
 from own_robots import CART
 from robots import ARM, SPRING
 

@@ -17,9 +17,7 @@ from madoc.robots.document import yaml_text
 from madoc.robots.expressions import Read
 from madoc.robots.model import AddedActuator, compiled, is_single, is_slide, make_model, read_model
 from madoc.robots.model_files import ModelFiles
-from madoc.robots.proposals import MOST, Proposal, proposals, rounded
-from madoc.robots.recipes import RECIPES, Recipe
-from madoc.robots.strength import is_servo, strengths
+from madoc.robots.proposals import MOST, RECIPES, Proposal, Recipe, is_servo, proposals, rounded, strengths
 from madoc.runs.files import replacing
 from madoc.simulation.write import element_names, free_joints
 from madoc.tasks import TASKS

@@ -1,20 +1,30 @@
-"""Parameters that a first spec proposes: which, in what order, in what ranges, and with which joints alike."""
+"""Parameters that a first spec proposes: which, in what order, in what ranges, and with which joints alike.
+
+Ranges of drives are those of a class of machines, or follow from how strong the drives are.
+"""
 
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
 
 from madoc.parameters import FIELDS, Parameter
 from madoc.robots.model import is_single, is_slide
-from madoc.robots.recipes import Ends, Recipe
 from madoc.robots.space import element_unit, gain_unit
-from madoc.robots.strength import FREE, actuators_of, is_servo, strengths
-from madoc.simulation.write import OF_A_JOINT, element_names, find_elements, has_gain, heavy_bodies, nominal_values
+from madoc.simulation.write import (
+    OF_A_JOINT,
+    element_names,
+    find_elements,
+    has_gain,
+    heavy_bodies,
+    nominal_values,
+    single_joints,
+)
 
+Ends = tuple[float, float]
 MOST = 40
 """Largest number of parameters proposed; further fields are written as comments, each with all of its lines."""
 _MANY = 10
@@ -26,13 +36,70 @@ _SIDES = frozenset(
 _WORDS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
 _ARMATURE, _FRICTION, _DAMPING = 0.01, 0.1, 0.03
 """Reflected inertia (s²), Coulomb friction (1) and damping (s) of a drive, as shares of its largest torque: at most
-what the machines of `recipes.py` have."""
+what the machines of `RECIPES` have."""
 _SERVO = 3.0
 """Factor by which the stiffness of a servo may be off."""
 _GUESS = 10.0
 """The same where the stiffness is a guess of `madoc init`."""
 _KV = 0.1
 """Largest damping of a servo, as a share of its stiffness, s."""
+FREE = 6
+"""Degrees of freedom of a body that moves freely."""
+_REACH = 10.0
+"""rad/s² (of a slide m/s²) that a drive reaches at least, where the model does not say how strong it is."""
+_WEAKEST = 0.2
+"""Strength of the weakest drive of a robot as a share of the strongest's of its kind, where the model says of neither:
+wrists carry little, and are driven by motors that are not as much smaller."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Ranges of a hinge's drive, at the joint; None leaves what follows from the model.
+
+    Attributes:
+        about: The machines that the ranges are of, for the spec's comment.
+        armature: Reflected inertia of the rotor, kg·m².
+        friction: Coulomb friction, N·m.
+        damping: Viscous friction, N·m·s/rad.
+        kp: Stiffness of the position servo, N·m/rad.
+        delay: From a command to its effect, s.
+        means: What the log's action of a joint is that the model does not drive.
+        limit: Torque limit of such a drive, N·m.
+    """
+
+    about: str
+    armature: Ends | None = None
+    friction: Ends | None = None
+    damping: Ends | None = None
+    kp: Ends | None = None
+    delay: Ends | None = None
+    means: str = "position"
+    limit: float | None = None
+
+
+_GEARMOTOR = Recipe(
+    "Dynamixel XL330 and MX-64 (BAM)", (0.0005, 0.05), (0.0, 0.5), (0.0, 0.5), delay=(0.0, 0.02), means="torque"
+)
+RECIPES = {
+    "hobby-servo": Recipe(
+        "Feetech STS3215 and Dynamixel XL330 (BAM); kp of an STS3215 at 7.4 V is 0.556 times its firmware's P",
+        (0.001, 0.05),
+        (0.0, 0.6),  # 0.2 N·m, and a quarter of half of the largest torque, as friction grows with the load
+        (0.0, 1.0),
+        (4.0, 40.0),
+        (0.0, 0.02),
+        limit=3.25,
+    ),
+    "harmonic-arm": Recipe("eRob 80:50 (BAM), Franka's wrist", (0.05, 1.0), (0.0, 7.0), (0.0, 5.0), delay=(0.0, 0.01)),
+    "direct-drive-leg": Recipe(
+        "Unitree Go1, Go2 and G1, ANYmal (PACE)", (0.002, 0.1), (0.0, 1.0), (0.0, 1.0), delay=(0.0, 0.025)
+    ),
+    "dc-gearmotor": _GEARMOTOR,
+    "wheeled": _GEARMOTOR,
+    "drone": Recipe("none: mass, inertia and thrust within what a model's file is usually wrong by", delay=(0.0, 0.05)),
+}
+"""By name of the class. BAM is Rhoban/bam, PACE leggedrobotics/pace-sim2real; of Go1 and G1 the values are mjlab's, of
+Go2 those of repeated identifications (iit-DLSLab/sim2real-robot-identification, issue 8)."""
 
 
 @dataclass(frozen=True)
@@ -103,12 +170,8 @@ def _limited(fields: list[list[Proposal]]) -> list[Proposal]:
     found: list[Proposal] = []
     for lines in fields:
         fits = sum(line.wanted for line in found + lines) <= MOST or not any(line.wanted for line in found)
-        found += [line if fits else _unwanted(line) for line in lines]
+        found += [line if fits else replace(line, wanted=False) for line in lines]
     return found
-
-
-def _unwanted(line: Proposal) -> Proposal:
-    return Proposal(line.field, line.elements, line.low, line.high, line.comment, wanted=False)
 
 
 def _moves_freely(model: mujoco.MjModel, body: str) -> bool:
@@ -223,7 +286,58 @@ def _contacts(model: mujoco.MjModel, wheels: set[str]) -> Iterator[Proposal]:
     touching = [geom for geom in geoms if geom.contype[0] or geom.conaffinity[0]]
     bodies = {int(model.joint(wheel).bodyid[0]) for wheel in wheels}
     rolling = [geom.name for geom in touching if int(geom.bodyid[0]) in bodies]
+    others = [geom.name for geom in touching if geom.name not in rolling]
     yield from _scaled(model, "geom_friction", rolling, wanted=True)
-    yield from _scaled(
-        model, "geom_friction", [geom.name for geom in touching if geom.name not in rolling], wanted=False
-    )
+    yield from _scaled(model, "geom_friction", others, wanted=False)
+
+
+def is_servo(model: mujoco.MjModel, actuator: str) -> bool:
+    """Whether an actuator holds a position: it pulls with a gain times the difference to its command."""
+    index = model.actuator(actuator).id
+    gain = float(model.actuator_gainprm[index, 0])
+    return has_gain(model, index) and gain > 0.0 and float(model.actuator_biasprm[index, 1]) == -gain
+
+
+def actuators_of(model: mujoco.MjModel, joint: int) -> list[int]:
+    """The actuators that act on a joint."""
+    on_joint = np.isin(model.actuator_trntype, OF_A_JOINT) & (model.actuator_trnid[:, 0] == joint)
+    return [int(actuator) for actuator in np.flatnonzero(on_joint)]
+
+
+def strengths(model: mujoco.MjModel) -> dict[str, tuple[float, bool]]:
+    """By hinge and slide, the largest torque or force of its drive, N·m or N, and whether the model says it.
+
+    Where it does not, that which holds what hangs on the joint and accelerates it.
+    """
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    joints = [(joint.name, int(joint.id), hinge) for joint, hinge in single_joints(model)]
+    needed = {name: _needed(model, data, index) for name, index, _ in joints}
+    found = {}
+    for name, index, hinge in joints:
+        largest = max(needed[other] for other, _, alike in joints if alike == hinge)
+        limit = _limit(model, index)
+        found[name] = (limit, True) if limit else (max(needed[name], _WEAKEST * largest), False)
+    return found
+
+
+def _limit(model: mujoco.MjModel, joint: int) -> float:
+    """The limit that the model gives a joint's drive; 0 where it gives none."""
+    limits = [abs(model.jnt_actfrcrange[joint]).max()] if model.jnt_actfrclimited[joint] else []
+    for actuator in actuators_of(model, joint):
+        gear = abs(float(model.actuator_gear[actuator, 0]))
+        if model.actuator_forcelimited[actuator]:
+            limits.append(gear * abs(model.actuator_forcerange[actuator]).max())
+        elif model.actuator_ctrllimited[actuator] and not model.actuator_biasprm[actuator].any():
+            limits.append(gear * abs(model.actuator_gainprm[actuator, 0] * model.actuator_ctrlrange[actuator]).max())
+    return min((float(limit) for limit in limits if limit > 0.0), default=0.0)
+
+
+def _needed(model: mujoco.MjModel, data: mujoco.MjData, joint: int) -> float:
+    """Torque or force that holds and accelerates what hangs on a joint; the legs of a free body carry all of it."""
+    body = int(model.jnt_bodyid[joint])
+    root = int(model.body_rootid[body])
+    carried = root if model.body_dofnum[root] == FREE else body
+    weight = float(model.body_subtreemass[carried]) * float(np.linalg.norm(model.opt.gravity))
+    lever = 1.0 if is_slide(model, joint) else float(np.linalg.norm(data.subtree_com[body] - data.xanchor[joint]))
+    return max(weight * lever, _REACH * float(model.dof_M0[model.jnt_dofadr[joint]]))

@@ -116,11 +116,8 @@ class CpuSimulator:
                 f"{self.task.name} carries {self.task.pending} past actions; widen the range of "
                 f"its {'action_lag' if of_lag else 'action_delay'}"
             )
-        return CpuSystem(self, models, np.minimum(delay, longest), lag, self._of_signals(values))
-
-    def _of_signals(self, values: Float[np.ndarray, "systems parameters"]) -> Float[np.ndarray, "systems signals"]:
-        """The bias of each signal, 0 where none is calibrated."""
-        return self.parameters.summed(values, "signal_bias", self.task.signals)
+        bias = self.parameters.summed(values, "signal_bias", self.task.signals)
+        return CpuSystem(self, models, np.minimum(delay, longest), lag, bias)
 
     def _of_actions(
         self, values: Float[np.ndarray, "systems parameters"], field: str
