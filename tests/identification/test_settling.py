@@ -10,7 +10,7 @@ from madoc import simulation, tasks
 from madoc.calibration import CalibrationProblem
 from madoc.data import Disturbance, disturb
 from madoc.identification import settling
-from madoc.identification.ensembles import certain_mean, few_of, next_noise, with_contacts_settled
+from madoc.identification.ensembles import few_of, next_noise, with_contacts_settled
 from madoc.identification.gauss_newton import FIRST_DAMPING
 from madoc.identification.replay import Readings
 from madoc.identification.settling import (
@@ -127,10 +127,3 @@ def test_few_states_have_the_mean_of_all_and_noise_follows_the_size_of_errors():
     noise, rounding = np.array([0.1, 0.1, 0.1, 1e-3, 1.0]), np.array([0.0, 0.04, 0.0, 0.0, 0.0])
     ratio = np.array([9.0, 0.09, 1e-9, 0.5, 1.0])  # at most twice as large, at least the root of a tenth
     np.testing.assert_allclose(next_noise(noise, ratio, rounding), [0.2, 0.04, 0.1 * np.sqrt(0.1), 1e-3, 1.0])
-
-
-def test_a_few_lost_windows_make_no_certain_cost():
-    assert certain_mean(np.array([1.0, 1.0, 1.0, 9.0])) == pytest.approx(3.0 - 2.0 * 4.0 / 2.0)
-    lost = np.array([0.9] * 30 + [8.9, 16.2])  # of an honest box that slides: 1.6 in the mean
-    assert certain_mean(lost) < 1.1 < certain_mean(np.full(32, 1.2) + 0.1 * np.tile([-1.0, 1.0], 16))
-    assert certain_mean(np.ones(1)) == 0.0

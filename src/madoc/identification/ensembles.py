@@ -131,13 +131,15 @@ class Innovations:
     def alike(self) -> float:
         """The largest correlation of a channel's whitened errors with the next ones that is certain, outliers clipped.
 
-        It is that of the first system; 0 for right predictions, as these use every reading before them.
+        It is that of the first system; 0 for right predictions, as these use every reading before them. What is certain
+        is what remains of a mean over windows less two standard errors.
         """
         errors = np.clip(self.whitened[0, self.whole[0], self.first :], -CLIP, CLIP)
-        if not len(errors):
+        if len(errors) < 2:
             return 0.0
         pairs, squares = (errors[:, 1:] * errors[:, :-1]).mean(1), (errors**2).mean((0, 1))
-        return float((certain_mean(pairs) / np.maximum(squares, _SMALLEST)).max(initial=0.0))
+        certain = pairs.mean(0) - 2.0 * pairs.std(0, ddof=1) / np.sqrt(len(pairs))
+        return float((certain / np.maximum(squares, _SMALLEST)).max(initial=0.0))
 
     def noise_ratio(self) -> Float[np.ndarray, " channels"]:
         """Mean square of each channel's prediction errors over their variance, outliers clipped; 1 if they are all 0.
@@ -148,13 +150,6 @@ class Innovations:
         relative = (self.mean[0] ** 2 / self.variances())[self.whole[0], self.first :].reshape(-1, self.mean.shape[-1])
         clipped = np.minimum(relative, CLIP**2).mean(0) / OF_CLIPPED if len(relative) else np.zeros(relative.shape[-1])
         return np.where(clipped == 0.0, 1.0, clipped)
-
-
-def certain_mean(values: Float[np.ndarray, " windows *kinds"]) -> Float[np.ndarray, " *kinds"]:
-    """What is certain of a mean over windows: it less two standard errors; 0 of fewer than two windows."""
-    if len(values) < 2:
-        return np.zeros(values.shape[1:])
-    return np.asarray(values.mean(0) - 2.0 * values.std(0, ddof=1) / np.sqrt(len(values)))
 
 
 def innovations(

@@ -27,7 +27,7 @@ from madoc.calibration.least_squares.instruments import (
 from madoc.calibration.least_squares.plan import FEWEST, Found
 from madoc.calibration.least_squares.statistics import LONG_TAILS, touched
 from madoc.data import stride
-from madoc.identification.ensembles import SPOILT, Innovations, certain_mean, innovations, next_noise, with_noise
+from madoc.identification.ensembles import SPOILT, Innovations, innovations, next_noise, with_noise
 from madoc.identification.gauss_newton import FIRST_DAMPING, TRIALS, damped_step
 from madoc.identification.information import sandwich
 from madoc.identification.losses import Loss
@@ -108,8 +108,7 @@ class FilterState:
         compared: Number of these windows.
         moved: The last step, by `moved_by`.
         damping: λ of the next step.
-        cost: Mean loss of a whitened prediction error before it, in squared standard deviations; at the end what of it
-            is certain, as an ensemble may lose a few windows at contacts.
+        cost: Mean loss of a whitened prediction error before it, in squared standard deviations.
         alike: The largest correlation that a channel's whitened error certainly has with that of the next reading, as
             noise has none; 0 until the end.
         wide: 0 in the first epochs, then 1 and the number of epochs since.
@@ -309,9 +308,7 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
             some = np.arange(min(state.size, len(rows)))
             fewer = problem.dataset, problem.states, problem.simulator, readings.of(some), rows[some]
             found, noise = with_noise(*fewer, state.point, state.noise, rounding, LARGE, LARGE_ROUNDS, random[2])
-            following = replace(
-                following, noise=noise, cost=float(certain_mean(_costs(found, loss))), alike=found.alike()
-            )
+            following = replace(following, noise=noise, cost=_cost(found, loss), alike=found.alike())
         return following, Epoch({"moved": state.moved})
     together = state.together + 1 if state.near else 0
     gradients, products, squares = (
@@ -332,7 +329,6 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
     ratio = np.mean([each.found.noise_ratio() for each in sides], axis=0)
     noise = next_noise(state.noise, 1.0 + (ratio - 1.0) / max(1, together), rounding)
     moved, pull = moved_by(undamped, error), bread @ undamped
-    costs = np.concatenate([_costs(each.found, loss) for each in sides])
     quiet = bool((((noise / state.noise) ** 2 - 1.0) ** 2).mean() < NOISE_SETTLED**2)
     refused = not np.array_equal(taken, np.clip(undamped, -LONGEST, LONGEST))
     following = replace(
@@ -346,7 +342,7 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
         squares=squares,
         meat=meat + np.outer(pull, pull),
         moved=max(moved, LIKE_CHANCE) if refused else moved,
-        cost=float(costs.mean()) if len(costs) else 0.0,
+        cost=float(np.mean([_cost(each.found, loss) for each in sides])),
         wide=state.wide + 1 if state.wide else int(state.epochs + 1 >= EARLY_EPOCHS or (quiet and moved < NEAR)),
         quiet=int(quiet),
         together=together,
@@ -357,9 +353,10 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
     return following, Epoch(metrics)
 
 
-def _costs(found: Innovations, loss: Loss) -> Float[np.ndarray, " whole"]:
-    """Mean loss of a whitened prediction error in each window in which no simulation failed."""
-    return window_costs(found.counted(found.whitened[0]), loss)[found.whole[0]]
+def _cost(found: Innovations, loss: Loss) -> float:
+    """Mean loss of a whitened prediction error in the windows in which no simulation failed; 0 if there are none."""
+    costs = window_costs(found.counted(found.whitened[0]), loss)[found.whole[0]]
+    return float(costs.mean()) if len(costs) else 0.0
 
 
 def _counted(
