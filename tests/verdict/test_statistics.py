@@ -5,7 +5,14 @@ import pytest
 
 from madoc.calibration.holdout import PredictionError, PredictionErrors
 from madoc.verdict.mismatch import at_most
-from madoc.verdict.statistics import better_than_chance, hides_gain, independent_groups, interval_of, resampled
+from madoc.verdict.statistics import (
+    better_than_chance,
+    beyond_noise,
+    hides_gain,
+    independent_groups,
+    interval_of,
+    resampled,
+)
 
 
 def test_the_interval_of_a_mean_is_as_wide_as_its_standard_error_says():
@@ -90,3 +97,11 @@ def test_noise_hides_the_gain_where_mid_range_errs_by_no_more_than_noise_does():
 
 def test_at_most_is_rounded_up():
     assert list(map(at_most, (0.1131, 0.01125, 0.011, 0.0))) == ["12 %", "1.2 %", "1.1 %", "0 %"]
+
+
+def test_errors_of_a_few_windows_are_certainly_beyond_noise_only_by_their_interval():
+    noise = PredictionError(5, 0.054, (0.04, 0.07))
+    few, many = PredictionError(5, 0.11, (0.09, 0.13)), PredictionError(5, 0.11, (0.109, 0.111))
+    assert beyond_noise([few], [noise]) == [(few, noise)]
+    assert beyond_noise([few], [noise], certain=True) == []
+    assert beyond_noise([many], [noise], certain=True) == [(many, noise)]

@@ -112,7 +112,7 @@ def far_beyond_noise(holdout: Judged) -> bool:
     errors = holdout.errors
     large = any(left.mean > NEGLIGIBLE for left in errors.nearby_best)
     explained = large and holdout.explained > 1.0 - ABOVE_NOISE**-2.0
-    return explained or bool(beyond_noise(errors.nearby_best, errors.noise))
+    return explained or bool(beyond_noise(errors.nearby_best, errors.noise, certain=True))
 
 
 def likeliest(terms: Sequence[MissingTerm]) -> MissingTerm | None:

@@ -163,14 +163,16 @@ def better_than_chance(
 
 
 def beyond_noise(
-    errors: Sequence[PredictionError], noise: Iterable[PredictionError]
+    errors: Sequence[PredictionError], noise: Iterable[PredictionError], *, certain: bool = False
 ) -> list[tuple[PredictionError, PredictionError]]:
     """The errors that noise does not explain, each with the error of noise alone.
 
-    It is the lower end of an error's interval that counts: the mean of a few windows may be as large by chance.
+    Where it is to be `certain`, the lower end of an error's interval counts: the mean of a few windows may be as large
+    by chance.
     """
     pairs = zip(errors, noise, strict=True)
-    return [(left, alone) for left, alone in pairs if left.interval[0] > max(NEGLIGIBLE, ABOVE_NOISE * alone.mean)]
+    least = ((left, alone, left.interval[0] if certain else left.mean) for left, alone in pairs)
+    return [(left, alone) for left, alone, size in least if size > max(NEGLIGIBLE, ABOVE_NOISE * alone.mean)]
 
 
 def beside_random(
