@@ -172,16 +172,18 @@ def fit_windows(
     readings: Readings,
     states: Float[np.ndarray, "windows state"],
     point: Float[np.ndarray, " d"],
+    most: int = LINEARISATIONS,
 ) -> Fit:
     """Parameters and initial states that explain the windows best, from near a given point.
 
     Steps are those of a robust loss, and are taken while they lower the median window's squared residual.
+    Derivatives are simulated anew at most so many times.
 
     Initial states are fitted alone before, as logged ones are noisy and their slopes are the cheaper ones.
     """
     states = fitted_states(simulator, readings, point, states, "cauchy")
     fit = _sloped(simulator, readings, states, point)
-    for _ in range(LINEARISATIONS):
+    for _ in range(most):
         moved, before = _descended(simulator, readings, fit), fit
         if moved is fit:
             break

@@ -30,7 +30,7 @@ WIDTHS = (3.0, 3.0, 1.5, 0.7, 0.3, 0.1, 0.0, 0.0)
 """Widths of the differences from step to step, in standard errors of the initial states; 0 is `DIFFERENCE`."""
 RESETTLING = (1.0, 0.3, 0.0)
 """The same where initial states are nearly right, as drawn by an ensemble."""
-STEPS = 10
+FIT_STEPS = 10
 """Largest number of steps by narrow differences."""
 GAIN = 0.01
 """Share in (0, 1] of a window's cost; after a step that saves less its initial state is fitted."""
@@ -127,7 +127,7 @@ def fitted_states(
     point: Float[np.ndarray, " d"],
     guesses: Float[np.ndarray, "windows state"],
     loss: Loss,
-    most: int = STEPS,
+    most: int = FIT_STEPS,
 ) -> Float[np.ndarray, "windows state"]:
     """Initial states after steps by narrow differences: each step moves the windows that the last one gained on.
 

@@ -14,7 +14,7 @@ from madoc.calibration.holdout import AgainstChance, Area
 from madoc.data import Dataset, stride
 from madoc.errors import MadocError
 from madoc.identification.fitted_windows import STRIDES
-from madoc.identification.settling import STEPS
+from madoc.identification.settling import FIT_STEPS
 from madoc.identification.states import LoggedStates, logged_states
 from madoc.identification.term_tests import FEWEST
 from madoc.identification.windows import consecutive_rows, evenly, horizons
@@ -108,9 +108,9 @@ class Bench:
         return steps / self.rate
 
     def steps_in_time(self, control_steps: int) -> int:
-        """How many steps of initial states there is time for, where `STEPS` simulate so many control steps."""
+        """How many steps of initial states there is time for, where `FIT_STEPS` simulate so many control steps."""
         share = self.rate * self.seconds_left / max(1, control_steps)
-        return int(np.clip(STEPS * min(1.0, share), FEWEST_STEPS, STEPS))
+        return int(np.clip(FIT_STEPS * min(1.0, share), FEWEST_STEPS, FIT_STEPS))
 
     def begins(self, part: str, seconds: float = 0.0) -> bool:
         """Whether there is time for a part that takes so long: it is told of, or noted where there is none."""

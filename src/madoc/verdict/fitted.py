@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from madoc.calibration.holdout import AgainstChance, Fitted
 from madoc.data import stride
-from madoc.identification.fitted_windows import fit_windows
+from madoc.identification.fitted_windows import LINEARISATIONS, fit_windows
 from madoc.identification.noise import residual_noise
 from madoc.simulation.attitudes import moved
 from madoc.verdict.bench import Bench
@@ -30,7 +30,8 @@ def fitted(
     """
     given = np.stack([np.zeros(len(point)), point])
     starts = replays.starts(given)
-    nearby = fit_windows(replays.simulator, replays.readings, starts[1], point).point[None]
+    most = min(LINEARISATIONS, replays.most_steps)
+    nearby = fit_windows(replays.simulator, replays.readings, starts[1], point, most).point[None]
     points = np.concatenate([given, nearby])
     residuals = np.concatenate([replays.residuals_from(given, starts), replays.residuals(nearby, starts[1])])
     sizes = magnitudes(replays.at_horizons(residuals))

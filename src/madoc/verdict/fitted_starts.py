@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from madoc.data import Dataset
 from madoc.identification.ensembles import likely_states
 from madoc.identification.replay import Readings
-from madoc.identification.settling import STEPS, fitted_states
+from madoc.identification.settling import FIT_STEPS, fitted_states
 from madoc.identification.states import LoggedStates, states_of
 from madoc.identification.windows import evenly, rows_that_fit
 from madoc.simulation.base import Simulator
@@ -46,7 +46,7 @@ class FittedReplays:
     episodes: Int[np.ndarray, " windows"]
     stride: int
     ahead: tuple[int, ...]
-    most_steps: int = STEPS
+    most_steps: int = FIT_STEPS
 
     @property
     def fitted(self) -> int:
@@ -90,7 +90,7 @@ class FittedReplays:
         """
         whole = self.readings
         first = replace(whole, actions=whole.actions[:, : self.fitted], observed=whole.observed[:, : self.fitted + 1])
-        if near is None or self.most_steps < STEPS:
+        if near is None or self.most_steps < FIT_STEPS:
             log = self.held, self.logged, self.simulator, first, self.rows
             likely = likely_states(*log, points, self.near)
         else:
@@ -102,7 +102,7 @@ class FittedReplays:
 def replay_steps(logged: LoggedStates, stride: int, parameters: int) -> int:
     """About how many control steps a window takes until it is judged: at four points, with noise, and nearby."""
     values, fitted, ahead = logged.physical_size, FITTED * stride, AHEAD[-1] * stride
-    starts = _POINTS * STEPS * (4 + values) * fitted
+    starts = _POINTS * FIT_STEPS * (4 + values) * fitted
     return starts + _NEARBY_STEPS * (1 + 2 * parameters + values) * (fitted + ahead)
 
 
