@@ -365,7 +365,8 @@ def test_an_epoch_at_rest_tells_what_half_the_ensemble_errs_and_moves_nothing(tm
     search = of_contacts(problem, jax.random.key(0))
     assert (search.blocks, len(search.rows)) == (1, 42)
     told = np.broadcast_to(np.eye(2), (len(search.rows), 2, 2))
-    rest = replace(search, point=np.array([0.0, 0.0]), wide=3, quiet=1, together=filtering.TOGETHER, squares=told)
+    truth = problem.simulator.parameters.to_unit(problem.simulator.parameters.vector(FOOT_TRUTH))
+    rest = replace(search, point=truth, wide=3, quiet=1, together=filtering.TOGETHER, squares=told)
     assert rest.at_rest and not rest.settled and rest.members == filtering.MEMBERS // 2
     (after, _), spent = counted(filtering.step, problem, rest, "cauchy")
     assert after.settled
@@ -377,6 +378,32 @@ def test_an_epoch_at_rest_tells_what_half_the_ensemble_errs_and_moves_nothing(tm
     systems = filtering.MEMBERS + 2 * 2 * len(problem.simulator.parameters) * instruments.FEW
     large = filtering.LARGE_ROUNDS * filtering.LARGE * search.size
     assert spent == (systems * len(search.rows) + large) * filtering.horizon_of(problem)
+
+
+def test_only_what_two_ensembles_lose_counts_as_lost(tmp_path, monkeypatch):
+    problem = problem_of_foot(tmp_path)
+    search = of_contacts(problem, jax.random.key(0))
+    told = np.broadcast_to(np.eye(2), (len(search.rows), 2, 2))
+    rest = replace(search, wide=3, quiet=1, together=filtering.TOGETHER, squares=told)
+    asked = []
+
+    def by_hand(found, loss):
+        """One ensemble loses the third window and the fifth, and fails in the sixth; the other loses the fifth."""
+        asked.append(len(found.mean[0]))
+        costs = np.full(search.size, 0.5)
+        costs[[2, 4, 5]] = 9.0, 9.0, np.inf
+        return costs if len(asked) == 1 else np.array([0.5, 7.0, np.inf])
+
+    monkeypatch.setattr(filtering, "surprises", by_hand)
+    (after, _), spent = counted(filtering.step, problem, rest, "cauchy")
+    assert asked == [search.size, 3]
+    assert after.cost == pytest.approx((0.5 * (search.size - 2) + 7.0) / (search.size - 1))
+    systems = filtering.MEMBERS + 2 * 2 * len(problem.simulator.parameters) * instruments.FEW
+    large = filtering.LARGE * (filtering.LARGE_ROUNDS * search.size + 3)
+    assert spent == (systems * len(search.rows) + large) * filtering.horizon_of(problem)
+    one = known(np.array([[[[2.0], [0.0]], [[1.0], [0.0]]]]))  # of two windows of two readings, one channel
+    failed = replace(one, whole=np.array([[True, False]]))
+    np.testing.assert_allclose(instruments.surprises(failed, "linear"), [2.0, np.inf])
 
 
 def test_epochs_near_the_end_take_other_windows_and_count_together(tmp_path):

@@ -21,19 +21,21 @@ from madoc.calibration.least_squares.instruments import (
     axes_of,
     beyond_chance,
     moved_by,
+    over_windows,
     products_of,
     shares_of,
+    surprises,
 )
 from madoc.calibration.least_squares.plan import FEWEST, Found
 from madoc.calibration.least_squares.statistics import LONG_TAILS, touched
 from madoc.data import stride
-from madoc.identification.ensembles import SPOILT, Innovations, innovations, next_noise, with_noise
+from madoc.identification.ensembles import SPOILT, innovations, next_noise, with_noise
 from madoc.identification.gauss_newton import FIRST_DAMPING, TRIALS, damped_step
 from madoc.identification.information import sandwich
 from madoc.identification.losses import Loss
 from madoc.identification.noise import WHITE
 from madoc.identification.replay import Readings
-from madoc.identification.settling import FAILED_WINDOW, window_costs
+from madoc.identification.settling import FAILED_WINDOW
 from madoc.identification.windows import disjoint_windows, interleaved, rows_that_fit
 from madoc.types import Epoch, generator
 
@@ -52,7 +54,7 @@ MEMBERS = 32
 """Number of states in an ensemble; the last epochs, with half as many, tell what a finite one errs."""
 LARGE, LARGE_ROUNDS = 64, 2
 """Number of states that tell at the end whether what is left is noise, as few leave errors that are alike, and how
-often the noise is estimated by them."""
+often noise is estimated by them. What one such ensemble loses is asked of another."""
 LONGEST = 0.5
 """Largest change of a parameter in an epoch, in [-1, 1]."""
 DAMPED = 10.0
@@ -306,9 +308,15 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
         )
         if following.settled:
             some = np.arange(min(state.size, len(rows)))
-            fewer = problem.dataset, problem.states, problem.simulator, readings.of(some), rows[some]
+            fewer = *log[:3], readings.of(some), rows[some]
             found, noise = with_noise(*fewer, state.point, state.noise, rounding, LARGE, LARGE_ROUNDS, random[2])
-            following = replace(following, noise=noise, cost=_cost(found, loss), alike=found.alike())
+            costs = surprises(found, loss)
+            if (lost := np.flatnonzero(costs > LONG_TAILS)).size:
+                # An ensemble may lose what it follows by chance. What the model lacks surprises another one as well.
+                again = *log[:3], readings.of(lost), rows[lost]
+                other, _ = with_noise(*again, state.point, noise, rounding, LARGE, 1, random[2])
+                costs[lost] = np.minimum(costs[lost], surprises(other, loss))
+            following = replace(following, noise=noise, cost=over_windows(costs), alike=found.alike())
         return following, Epoch({"moved": state.moved})
     together = state.together + 1 if state.near else 0
     gradients, products, squares = (
@@ -342,7 +350,7 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
         squares=squares,
         meat=meat + np.outer(pull, pull),
         moved=max(moved, LIKE_CHANCE) if refused else moved,
-        cost=float(np.mean([_cost(each.found, loss) for each in sides])),
+        cost=float(np.mean([over_windows(surprises(each.found, loss)) for each in sides])),
         wide=state.wide + 1 if state.wide else int(state.epochs + 1 >= EARLY_EPOCHS or (quiet and moved < NEAR)),
         quiet=int(quiet),
         together=together,
@@ -351,12 +359,6 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
     )
     metrics = {"residual": following.cost**0.5, "moved": following.moved, "noise": float(np.median(noise))}
     return following, Epoch(metrics)
-
-
-def _cost(found: Innovations, loss: Loss) -> float:
-    """Mean loss of a whitened prediction error in the windows in which no simulation failed; 0 if there are none."""
-    costs = window_costs(found.counted(found.whitened[0]), loss)[found.whole[0]]
-    return float(costs.mean()) if len(costs) else 0.0
 
 
 def _counted(

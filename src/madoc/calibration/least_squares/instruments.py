@@ -23,6 +23,7 @@ from madoc.identification.ensembles import SPOILT, Innovations, few_of, innovati
 from madoc.identification.linearisation import LEAST_CURVATURE
 from madoc.identification.losses import TUNING, Loss, curvature_share, loss_slope
 from madoc.identification.replay import Readings
+from madoc.identification.settling import window_costs
 
 FEW = 2
 """Number of states at the ends of differences and after steps that are tried; time is better spent on more windows."""
@@ -176,3 +177,14 @@ def beyond_chance(
     covariance = count / (count - 1.0) * (squares - np.outer(total, total) / count) + least
     usual = size * (count - 1.0) / (count - size - 2.0)
     return total * (1.0 - usual / max(float(total @ np.linalg.solve(covariance, total)), usual)) ** 0.5
+
+
+def surprises(found: Innovations, loss: Loss) -> Float[np.ndarray, " windows"]:
+    """Mean loss of a whitened prediction error that counts in each window; infinite where a simulation failed."""
+    return np.where(found.whole[0], window_costs(found.counted(found.whitened[0]), loss), np.inf)
+
+
+def over_windows(costs: Float[np.ndarray, " windows"]) -> float:
+    """The mean over windows in which no simulation failed; 0 if there are none."""
+    known = costs[np.isfinite(costs)]
+    return float(known.mean()) if len(known) else 0.0
