@@ -45,6 +45,7 @@ class Wander:
     bad_epoch: int = -1
     bad_place: str = "metric"
     converged_epoch: int = 10**9
+    following: int | None = None
 
     def init(self, problem, key):
         return Walk(jnp.zeros(4), np.zeros(4), np.zeros((64, 4), np.float32), key, 0, jnp.tanh)
@@ -73,6 +74,7 @@ class Wander:
             stage="cloning" if clones else "learning",
             fraction=state.epoch / self.cloning if clones else None,
             converged="it stood still" if state.epoch >= self.converged_epoch else None,
+            following=self.following,
         )
 
 

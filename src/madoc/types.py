@@ -97,6 +97,7 @@ class Epoch:
         stage: The kind of the epoch in a word, such as `cloning`.
         fraction: Share of the preparation that is done, if the epoch prepares and spends none of the budget.
         converged: The reason in a sentence, once the method has stopped by itself.
+        following: About how many control steps the next step simulates, if the method knows.
     """
 
     metrics: Metrics = field(default_factory=dict)
@@ -106,6 +107,7 @@ class Epoch:
     stage: str = "calibrating"
     fraction: float | None = None
     converged: str | None = None
+    following: int | None = None
 
 
 @runtime_checkable

@@ -1,6 +1,7 @@
 import json
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -310,3 +311,13 @@ def test_a_time_budget_is_kept_across_a_resume(tmp_path):
     assert second.status == "finished"
     assert second.seconds >= first.seconds + 0.3
     assert second.control_steps - first.control_steps <= 10 * (second.seconds - first.seconds) / 0.02 + 10
+
+
+def test_a_step_that_would_outlast_the_time_is_not_begun(tmp_path):
+    ahead = Wander(seconds=0.05, cloning=0, following=10_000)  # a thousand times the first step, of at least 0.05 s
+    first = in_folder(tmp_path / "run", method=ahead, budget=Seconds(30.0))
+    assert (first.status, first.control_steps) == ("finished", 10)
+    assert re.fullmatch(r"\d+ of 30 s are spent, and the next step takes about \d+ s", first.sentence)
+    again = in_folder(tmp_path / "run", method=ahead, budget=Seconds(30.0), resume=True)
+    assert (again.control_steps, again.sentence) == (first.control_steps, first.sentence)
+    assert in_folder(tmp_path / "count", method=ahead, budget=30).control_steps == 30

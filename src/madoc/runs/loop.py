@@ -24,6 +24,8 @@ Status = Literal["finished", "converged", "interrupted", "diverged"]
 
 PREPARATION = 0.1
 """Share of the progress bar for the preparation of a method that has one."""
+OVER = 0.1
+"""Share of a time budget by which a step may outlast it. One that is expected to take longer is not begun."""
 
 
 @dataclass(frozen=True)
@@ -173,6 +175,8 @@ class _Session(Generic[State]):
         self._log: RunLog | None = None
         self._offset = 0
         self._earlier = 0.0
+        self._ahead = 0.0
+        self._began = 0.0
         self._started: float | None = None
         self._stopped: float | None = None
         self._measured = False
@@ -182,8 +186,9 @@ class _Session(Generic[State]):
             self._good = self.state
             self._tally = Tally(**extra["tally"])
             self._offset = int(extra["metrics_bytes"])
-            self._earlier = float(extra["seconds"])
+            self._earlier = self._began = float(extra["seconds"])
             self._peak = extra.get("peak_memory")
+            self._ahead = float(extra.get("ahead", 0.0))
 
     @property
     def spent(self) -> int:
@@ -195,6 +200,13 @@ class _Session(Generic[State]):
         if isinstance(self._budget, Seconds):
             return self._seconds() / self._budget.seconds
         return self.spent / self._budget
+
+    @property
+    def _fits(self) -> bool:
+        """Whether there is time for the next step, which may take a little longer than the budget."""
+        if not isinstance(self._budget, Seconds):
+            return True
+        return self._seconds() + self._ahead <= (1.0 + OVER) * self._budget.seconds
 
     @property
     def _allowed(self) -> str:
@@ -227,6 +239,9 @@ class _Session(Generic[State]):
                 self.outcome = "converged", self._tally.converged
             elif self._share >= 1.0:
                 self.outcome = "finished", f"the budget of {self._allowed} is spent"
+            elif not self._fits:
+                about = f"the next step takes about {self._ahead:.0f} s"
+                self.outcome = "finished", f"{self._used} of {self._allowed} are spent, and {about}"
             elif interrupted:
                 self.outcome = "interrupted", f"interrupted at {self._used} of {self._allowed}"
         return self.outcome is not None
@@ -237,6 +252,9 @@ class _Session(Generic[State]):
 
     def take(self, state: State, epoch: Epoch) -> Metrics:
         """Accept the result of a step, log it, and check that its metrics are finite."""
+        seconds = self._seconds()
+        of_each = (seconds - self._began) / epoch.control_steps if epoch.control_steps else 0.0
+        self._began, self._ahead = seconds, of_each * (epoch.following or 0)
         self.state, self._tally = state, self._tally.plus(epoch)
         self._look_at_memory()
         metrics = {name: float(value) for name, value in epoch.metrics.items()}
@@ -318,7 +336,7 @@ class _Session(Generic[State]):
         self._peak = None if now is None or self._peak is None else max(now, self._peak)
 
     def _write_state(self, path: Path, metrics_bytes: int) -> None:
-        cost = {"seconds": self._seconds(), "peak_memory": self._peak}
+        cost = {"seconds": self._seconds(), "peak_memory": self._peak, "ahead": self._ahead}
         extra = {"tally": asdict(self._tally), "metrics_bytes": metrics_bytes} | cost
         checkpoint.save(path, self.state, extra)
 

@@ -140,7 +140,18 @@ class LeastSquares:
             search, epoch = self._known(problem).step(problem, state.known)
             state = self._then_predicting(problem, self._after_known(problem, replace(state, known=search)))
         converged = "another iteration would hardly change any estimate" if state.finished else None
-        return state, replace(epoch, control_steps=SIMULATED.control_steps - began, converged=converged)
+        spent, following = SIMULATED.control_steps - began, self._following(problem, state)
+        return state, replace(epoch, control_steps=spent, converged=converged, following=following)
+
+    def _following(self, problem: CalibrationProblem, state: LeastSquaresState) -> int | None:
+        """About how many control steps the next step simulates; None once it fits predictions, and at the end."""
+        if state.finished or (state.prediction is not None and state.prediction.progress == "under way"):
+            return None
+        if state.stage == "filtering" and state.filtered is not None:
+            return filtering.epoch_steps(problem, state.filtered)
+        if state.estimates_starts:
+            return self._unknown(problem, state.length).epoch_steps(problem, state.unknown[state.length])
+        return None if state.known is None else self._known(problem).epoch_steps(problem, state.known)
 
     def _then_predicting(self, problem: CalibrationProblem, state: LeastSquaresState) -> LeastSquaresState:
         """Begin the fit for prediction once the searches have ended, if they left more than noise."""
@@ -160,9 +171,8 @@ class LeastSquares:
 
     def _found(self, problem: CalibrationProblem, state: LeastSquaresState) -> Found:
         """What the search in progress, or the best one, has found."""
-        if state.filters:
-            assert state.filtered is not None
-            return state.filtered.found
+        if state.by_filter is not None:
+            return state.by_filter.found
         best = self._fitted(state)
         if state.estimates_starts:
             windows, settled = best.explained, self._unknown(problem).settled(best)
@@ -365,9 +375,8 @@ class LeastSquares:
 
     def _notes(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[str, ...]:
         """A sentence on estimated initial states, unless the user asked for them."""
-        if state.filters:
-            assert state.filtered is not None
-            return (sentences.about_filtered_states(problem, state.filtered, asked=self.initial_states is not None),)
+        if state.by_filter is not None:
+            return (sentences.about_filtered_states(problem, state.by_filter, asked=self.initial_states is not None),)
         if not state.estimates_starts or self.initial_states is not None:
             return ()
         horizon = self._unknown(problem, state.best).horizon
@@ -375,9 +384,8 @@ class LeastSquares:
 
     def _about_residuals(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[str, ...]:
         """Sentences on what estimated initial states leave, unless the user asked for them."""
-        if state.filters:
-            assert state.filtered is not None
-            return sentences.about_surprises(state.filtered)
+        if state.by_filter is not None:
+            return sentences.about_surprises(state.by_filter)
         if not state.estimates_starts or self.initial_states is not None:
             return ()
         best = state.unknown[state.best]

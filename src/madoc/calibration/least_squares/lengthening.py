@@ -90,13 +90,13 @@ class LeastSquaresState:
         return self.stage in ("estimated", "lengthening")
 
     @property
-    def filters(self) -> bool:
-        """Whether the estimate is that of the filter, as long as a search after it does not explain much more."""
+    def by_filter(self) -> FilterState | None:
+        """The filter if the estimate is its own, as long as a search after it does not explain much more."""
         if self.filtered is None or self.stage not in ("filtering", "estimated"):
-            return False
+            return None
         first = self.unknown[0] if self.unknown else None
         follows = first is not None and first.epochs >= FIRST_STEPS and leaves_much_less(first, self.filtered)
-        return self.stage == "filtering" or not follows
+        return self.filtered if self.stage == "filtering" or not follows else None
 
     @property
     def searched(self) -> bool:

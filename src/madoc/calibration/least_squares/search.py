@@ -232,7 +232,7 @@ class Search:
     def whole_run(self, problem: CalibrationProblem, state: SearchState, refining_epochs: int) -> int:
         """Control steps of the longest search, unless it has ended, and of `refining_epochs` on all windows."""
         searching, refining, settling = (
-            self._epoch_steps(problem, replace(state, refining=stage, waiting=waiting))
+            self.epoch_steps(problem, replace(state, refining=stage, waiting=waiting))
             for stage, waiting in ((0, 0), (1, 0), (1, 1))
         )
         waiting = max(state.waiting, int(self.starts.unknown and not state.refining))
@@ -241,7 +241,7 @@ class Search:
     def _running(self, state: SearchState) -> int:
         return 1 if state.refining else self.searches
 
-    def _epoch_steps(self, problem: CalibrationProblem, state: SearchState) -> int:
+    def epoch_steps(self, problem: CalibrationProblem, state: SearchState) -> int:
         """About how many control steps an epoch simulates."""
         tried = self.starts.trial_columns(refining=bool(state.refining))
         columns = self.starts.settling_columns(problem) if state.waiting else self.starts.columns(problem) + tried
