@@ -69,8 +69,9 @@ def test_the_best_nearby_is_the_estimate_where_every_simulation_fails(monkeypatc
 def test_starts_take_fewer_steps_where_time_is_short(monkeypatch):
     judged = replace(bench(log_of("arm", rows=400), ROBOTS["arm"][0]), until=100.0, rate=50.0)
     monkeypatch.setattr("madoc.verdict.bench.time.monotonic", lambda: 90.0)
-    assert [judged.steps_in_time(each) for each in (500, 1000, 10**6)] == [10, 5, 2]
-    assert replace(judged, until=None).steps_in_time(10**6) == 10
+    assert [judged.steps_in_time(each, 1.0) for each in (500, 1000, 10**6)] == [10, 5, 2]
+    assert [judged.steps_in_time(each, 0.5) for each in (250, 500, 10**6)] == [10, 5, 2]
+    assert replace(judged, until=None).steps_in_time(10**6, 0.5) == 10
 
 
 def test_the_hold_out_leaves_time_for_tests_of_the_model(monkeypatch):

@@ -26,20 +26,21 @@ def expected_half_widths(
     noise: Float[np.ndarray, " observation"],
     *,
     exact: bool,
+    most: int = WINDOWS,
 ) -> Float[np.ndarray, " d"]:
     """Half of each parameter's smallest possible 95 % interval in [-1, 1].
 
     It is computed from the Fisher information at `point`, as if the noise of all observations were independent, plus
     the prior information of the box: of single steps from logged states if these are `exact`, else of windows whose
     initial states are eliminated. `noise` is the standard deviation of a single step's residuals where states are
-    exact, else of an observation, in its unit.
+    exact, else of an observation, in its unit. At `most` so many windows are differentiated.
     """
     windows = probing_windows(
         logged,
         dataset,
         simulator,
         steps=1 if exact else horizons(dataset)[-1],
-        count=SINGLE_STEPS if exact else WINDOWS,
+        count=SINGLE_STEPS if exact else most,
     )
     if exact:
         points = difference_points(point)

@@ -107,10 +107,13 @@ class Bench:
         steps = STRIDES * stride(self.problem.dataset) * (COLUMNS + COLUMNS_OF_A_VALUE * values)
         return steps / self.rate
 
-    def steps_in_time(self, control_steps: int) -> int:
-        """How many steps of initial states there is time for, where `FIT_STEPS` simulate so many control steps."""
-        share = self.rate * self.seconds_left / max(1, control_steps)
-        return int(np.clip(FIT_STEPS * min(1.0, share), FEWEST_STEPS, FIT_STEPS))
+    def steps_in_time(self, control_steps: int, share: float) -> int:
+        """How many steps of initial states fit into a share of the time left.
+
+        `FIT_STEPS` of them simulate so many control steps.
+        """
+        fits = share * self.rate * self.seconds_left / max(1, control_steps)
+        return int(np.clip(FIT_STEPS * min(1.0, fits), FEWEST_STEPS, FIT_STEPS))
 
     def begins(self, part: str, seconds: float = 0.0) -> bool:
         """Whether there is time for a part that takes so long: it is told of, or noted where there is none."""
@@ -162,7 +165,9 @@ class Bench:
         room = 1.0 - self.windows_to_test * self.window_seconds / max(self.seconds_left, 1e-9)
         share = min(room, FITTING) if room >= LEAST_FITTING else FITTING
         most = self.windows_in_time(columns, share, count)
-        return replace(self.fittable.of(evenly(np.arange(count), most)), most_steps=self.steps_in_time(most * columns))
+        return replace(
+            self.fittable.of(evenly(np.arange(count), most)), most_steps=self.steps_in_time(most * columns, share)
+        )
 
     @cached_property
     def fittable(self) -> FittedReplays | None:

@@ -204,7 +204,7 @@ def _from_fitted(
     moving, of_models, rows = stride(bench.problem.dataset), [], np.empty(0, np.int64)
     of_window = replay_steps(bench.states, moving, 0) * 4 // 5 + (4 + IMITATED) * steps
     most = bench.windows_in_time(of_window, SHARE, MOST)
-    most_steps = bench.steps_in_time(most * of_window)
+    most_steps = bench.steps_in_time(most * of_window, SHARE)
     for simulator, points in _models(bench, given, point):
         replays = fitted_replays_of(
             bench.held_out, simulator, bench.change, moving, ahead=(steps,), fewest=1, most=most

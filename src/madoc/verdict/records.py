@@ -16,7 +16,7 @@ from madoc.diagnosis.exchanged_columns import exchanged_columns
 from madoc.diagnosis.scales import coarseness
 from madoc.identification.candidate_effects import FINER
 from madoc.identification.candidate_terms import DELAY, INTEGRATION, LAG
-from madoc.identification.excitation import expected_half_widths
+from madoc.identification.excitation import WINDOWS, expected_half_widths
 from madoc.identification.fitted_windows import SHORTER, windows_of
 from madoc.identification.information import OPEN
 from madoc.identification.missing_terms import OTHER_WINDOWS, Suspicions, suspicions
@@ -43,6 +43,8 @@ from madoc.verdict.statistics import NEGLIGIBLE
 _MOST_TERMS = 5
 """Number of missing terms that a report keeps, the most significant ones; besides them the integration step's and all
 that are certain are kept, as a verdict rests on them."""
+NARROWEST = 0.1
+"""Share in (0, 1) of the time left that the narrowest intervals which the log allows may take."""
 EXCHANGED = "exchanged columns"
 """A part of judging without which nothing is tested."""
 FEWER = "tests on as many windows as usual"
@@ -270,10 +272,12 @@ def _best_half_widths(
     """
     given = bench.problem.states, bench.problem.dataset, bench.problem.simulator, at
     residual = np.maximum(residual, NEGLIGIBLE) * bench.change[: len(residual)]
-    half = expected_half_widths(*given, residual, exact=exact)
+    values = 1 + 2 * len(at) + bench.states.physical_size
+    most = bench.windows_in_time(horizons(bench.problem.dataset)[-1] * values, NARROWEST, WINDOWS)
+    half = expected_half_widths(*given, residual, exact=exact, most=most)
     if sensors is None:
         return half
-    fitted = expected_half_widths(*given, np.maximum(sensors, NEGLIGIBLE) * bench.change, exact=False)
+    fitted = expected_half_widths(*given, np.maximum(sensors, NEGLIGIBLE) * bench.change, exact=False, most=most)
     return np.minimum(half, fitted)
 
 
