@@ -14,6 +14,7 @@ from madoc.calibration.holdout import AgainstChance, Judged, RicherModel
 from madoc.data.findings import Finding
 from madoc.diagnosis.exchanged_columns import exchanged_columns
 from madoc.diagnosis.scales import coarseness
+from madoc.diagnosis.speeds import rates_contradict
 from madoc.identification.candidate_effects import FINER
 from madoc.identification.candidate_terms import DELAY, INTEGRATION, LAG
 from madoc.identification.excitation import WINDOWS, expected_half_widths
@@ -148,6 +149,10 @@ def judged(
     in_time = actions_in_time(doubts.terms, bench.simulator.control_step)
     against = (each for each in (*exchanged, *problem.dataset.findings) if each.contradicts)
     contradicting = tuple(each for each in against if not (each.late and in_time))
+    if any(each.of_rows for each in contradicting) and bench.states_known:
+        values = space.to_physical(np.clip(point, -1.0, 1.0))
+        if not rates_contradict(problem.dataset, problem.simulator, values):
+            contradicting = tuple(each for each in contradicting if not each.of_rows)
     ends = point[:, None] + np.outer(own, (-1.0, 1.0)) if interval is None else space.to_unit(interval.T).T
     widths = space, point[:, None] + np.outer(best, (-1.0, 1.0)), ends, own
     shares = _shares(*widths, doubts.alternatives)
