@@ -187,12 +187,8 @@ class FilterState:
 
     @property
     def near(self) -> bool:
-        """Whether the next step is to be by the next epoch and those before it that count together.
-
-        Not after one whose own windows disagree with those before it: of a step that they alone ask for, one part in
-        `together` is taken, and their own standard error is larger by its root.
-        """
-        return self.wide > 1 and bool(self.quiet) and self.moved * max(1, self.together) ** 0.5 < NEAR
+        """Whether the next step is to be by the next epoch and those before it that count together."""
+        return self.wide > 1 and bool(self.quiet) and self.moved < NEAR
 
     @property
     def found(self) -> Found:
