@@ -9,6 +9,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +17,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from madoc.runs.machine import usable_cores
 from madoc.simulation.outlines import outlines
 
 LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}
@@ -64,8 +66,11 @@ def pictures(
                 mujoco.mj_saveModel(model, str(folder / "model.mjb"))
                 asked = {"states": states, "ghost": beside, "size": np.array([width, height])} | vars(camera)
                 np.savez(folder / "asked.npz", allow_pickle=False, **asked)
-            if _draw(folder, library):
-                return np.load(folder / "pictures.npy", allow_pickle=False)
+            if _draw(folder, library, len(states)):
+                files = [folder / f"panel_{panel}.npy" for panel in range(len(states))]
+                drawn = np.stack([np.load(file, allow_pickle=False) for file in files])
+                if np.ptp(drawn):  # else OpenGL has drawn nothing
+                    return drawn
     of_ghost = outlines(model, beside)[0]
     each = zip(states, camera.centre, strict=True)
     return np.stack([_sketches(model, *part, of_ghost, camera=camera, width=width, height=height) for part in each])
@@ -136,13 +141,19 @@ def _ways() -> list[str]:
     return [way for way, library in LIBRARIES.items() if ctypes.util.find_library(library)]
 
 
-def _draw(folder: Path, way: str) -> bool:
-    """Let a process draw what the folder asks; whether it did."""
+def _draw(folder: Path, way: str, panels: int) -> bool:
+    """Let a process for each panel draw what the folder asks; whether all did."""
     words = [sys.executable, "-P", str(Path(__file__).with_name("render_process.py")), str(folder)]
     environment = os.environ | {"MUJOCO_GL": way, "PYOPENGL_PLATFORM": way}
-    with contextlib.suppress(subprocess.TimeoutExpired):
-        done = subprocess.run(
-            words, env=environment, timeout=TIMEOUT, stdin=subprocess.DEVNULL, capture_output=True, check=False
-        )
-        return done.returncode == 0
-    return False
+
+    def drawn(panel: int) -> bool:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            asked = [*words, str(panel)]
+            done = subprocess.run(
+                asked, env=environment, timeout=TIMEOUT, stdin=subprocess.DEVNULL, capture_output=True, check=False
+            )
+            return done.returncode == 0
+        return False
+
+    with ThreadPoolExecutor(usable_cores()) as pool:
+        return all(list(pool.map(drawn, range(panels))))

@@ -15,8 +15,8 @@ ELEVATION = -8.0
 """Angle of view above the horizontal, deg."""
 
 
-def main(folder: Path) -> None:
-    """Draw `asked.npz` of `model.mjb` into `pictures.npy`."""
+def main(folder: Path, panel: int) -> None:
+    """Draw a panel of `asked.npz` of `model.mjb` into `panel_N.npy`."""
     model = mujoco.MjModel.from_binary_path(str(folder / "model.mjb"))
     with np.load(folder / "asked.npz", allow_pickle=False) as file:
         asked = dict(file)
@@ -28,19 +28,14 @@ def main(folder: Path) -> None:
     camera = mujoco.MjvCamera()
     camera.azimuth, camera.elevation, camera.distance = float(asked["azimuth"]), ELEVATION, float(asked["distance"])
     data, beside = mujoco.MjData(model), mujoco.MjData(model)
-    panels, frames = asked["states"].shape[:2]
-    drawn, every = np.zeros((panels, frames, height, width, 3), dtype=np.uint8), 1
+    states, centres = asked["states"][panel], asked["centre"][panel]
+    drawn, every = np.zeros((len(states), height, width, 3), dtype=np.uint8), 1
     with mujoco.Renderer(model, 2 * height, 2 * width, max_geom=2 * model.ngeom + 100) as renderer:
-        for panel, frame in np.ndindex(panels, frames):
+        for frame, (state, ghost) in enumerate(zip(states, asked["ghost"], strict=True)):
             if frame % every:
-                drawn[panel, frame] = drawn[panel, frame - 1]
+                drawn[frame] = drawn[frame - 1]
                 continue
-            began = time.monotonic()
-            state, ghost, camera.lookat[:] = (
-                asked["states"][panel, frame],
-                asked["ghost"][frame],
-                asked["centre"][panel, frame],
-            )
+            began, camera.lookat[:] = time.monotonic(), centres[frame]
             _pose(model, data, state)
             renderer.update_scene(data, camera)
             if not np.isfinite(state[: model.nq]).all():  # a simulation that has failed is nowhere
@@ -50,12 +45,10 @@ def main(folder: Path) -> None:
                 _pose(model, beside, ghost)
                 _add_ghost(model, beside, renderer.scene)
             _add_paper(camera, renderer.scene)
-            drawn[panel, frame] = renderer.render().reshape(height, 2, width, 2, 3).mean((1, 3))
-            if (panel, frame) == (0, 1):  # the first loads the model's meshes
-                every = int(np.ceil((time.monotonic() - began) * panels * frames / SECONDS))
-    if not np.ptp(drawn, axis=(0, 1, 2, 3)).any():
-        raise SystemExit("nothing was drawn")
-    np.save(folder / "pictures.npy", drawn)
+            drawn[frame] = renderer.render().reshape(height, 2, width, 2, 3).mean((1, 3))
+            if frame == 1:  # the first loads the model's meshes
+                every = int(np.ceil((time.monotonic() - began) * len(states) / SECONDS))
+    np.save(folder / f"panel_{panel}.npy", drawn)
 
 
 def _pose(model: mujoco.MjModel, data: mujoco.MjData, state: np.ndarray) -> None:
@@ -91,4 +84,4 @@ def _add_paper(camera: mujoco.MjvCamera, scene: mujoco.MjvScene) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(Path(sys.argv[1]), int(sys.argv[2]))
