@@ -66,8 +66,8 @@ def planted(folder: Path, count: int) -> dict[str, dict[str, float]]:
         truth |= ODD.get(number, {})
         place = folder / "robots" / f"pendulum-{number:03d}"
         place.mkdir(parents=True)
-        for run in range(RUNS):
-            columns = record(robot, truth, round(SECONDS / robot.spec.control_step), noise=NOISE, random=random)
+        rows = round(SECONDS / robot.spec.control_step)
+        for run, columns in enumerate(record(robot, truth, rows, runs=RUNS, noise=NOISE, random=random)):
             own = {robot.spec.log.columns.get(name, name): values for name, values in columns.items()}
             table = np.stack(list(own.values()), -1)
             np.savetxt(place / f"run_{run}.csv", table, "%.9g", ",", header=",".join(own), comments="")

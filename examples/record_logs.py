@@ -30,31 +30,33 @@ def main() -> None:
     random = np.random.default_rng(arguments.seed)
     rows = round(arguments.seconds / robot.spec.control_step)
     arguments.out.mkdir(parents=True, exist_ok=True)
-    for run in range(arguments.runs):
-        columns = record(robot, truth, rows, noise=arguments.noise, random=random)
+    runs = record(robot, truth, rows, runs=arguments.runs, noise=arguments.noise, random=random)
+    for run, columns in enumerate(runs):
         file = arguments.out / f"run_{run}.csv"
         np.savetxt(file, np.stack(list(columns.values()), -1), "%.9g", ",", header=",".join(columns), comments="")
         print(f"{file}: {rows} rows")
 
 
 def record(
-    robot: robots.Robot, truth: dict[str, float], rows: int, *, noise: float, random: np.random.Generator
-) -> dict[str, np.ndarray]:
-    """Columns of one run from rest, pushed by commands that change every tenth of a second."""
+    robot: robots.Robot, truth: dict[str, float], rows: int, *, runs: int, noise: float, random: np.random.Generator
+) -> list[dict[str, np.ndarray]]:
+    """Columns of runs from rest, pushed by commands that change every tenth of a second; all have the same sensors."""
     simulator = simulation.make(robot.task)
     system = simulator.bind(simulator.parameters.vector(truth)[None])
     held = max(1, round(0.1 / robot.spec.control_step))
-    commands = np.repeat(random.uniform(-1.0, 1.0, (rows // held + 1, len(robot.actions))), held, axis=0)[:rows]
-    state, seen = simulator.initial_state[None, None], []
-    for command in commands:
-        seen.append(np.asarray(system.observe(state))[0, 0])
-        state = system.step(state, command[None, None])
-    signals = np.stack(seen)
-    signals += noise * signals.std(axis=0) * random.standard_normal(signals.shape)
+    draws = random.uniform(-1.0, 1.0, (runs, rows // held + 1, len(robot.actions)))
+    commands = np.repeat(draws, held, axis=1)[:, :rows]
+    state, seen = np.repeat(simulator.initial_state[None, None], runs, axis=1), []
+    for command in np.swapaxes(commands, 0, 1):
+        seen.append(np.asarray(system.observe(state))[0])
+        state = system.step(state, command[None])
+    signals = np.stack(seen, axis=1)
+    signals += noise * signals.std(axis=(0, 1)) * random.standard_normal(signals.shape)
     low, high = (np.array([getattr(channel, end) for channel in robot.actions]) for end in ("low", "high"))
     names = ("time", *(channel.name for channel in (*robot.signals, *robot.actions)))
-    values = (robot.spec.control_step * np.arange(rows), *signals.T, *(low + (commands + 1) / 2 * (high - low)).T)
-    return dict(zip(names, values, strict=True))
+    times, actions = robot.spec.control_step * np.arange(rows), low + (commands + 1) / 2 * (high - low)
+    values = ((times, *signals[run].T, *actions[run].T) for run in range(runs))
+    return [dict(zip(names, each, strict=True)) for each in values]
 
 
 if __name__ == "__main__":
