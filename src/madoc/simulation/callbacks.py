@@ -10,10 +10,11 @@ MuJoCo by itself refuses that file, as it would simulate a drive without torque.
 
 import ctypes
 import math
+from collections import namedtuple
 from functools import cache
 from inspect import unwrap
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -235,38 +236,17 @@ def _function(name: str) -> Any:
     return function
 
 
-class _Places(NamedTuple):
-    """Where the sizes and pointers that are used here lie in mjModel and mjData, in words of their own size."""
+_Named = namedtuple(
+    "_Named",
+    "nu nv njnt nuser_jnt nuser_actuator jnt_user dof_jntid dof_frictionloss actuator_user actuator_ctrlrange "
+    "ne nf nefc nisland ctrl qvel qfrc_spring qfrc_applied qfrc_bias qfrc_actuator actuator_length "
+    "actuator_velocity ten_length ten_velocity efc_type efc_id efc_frictionloss iefc_frictionloss "
+    "map_efc2iefc",
+)
 
-    nu: int
-    nv: int
-    njnt: int
-    nuser_jnt: int
-    nuser_actuator: int
-    jnt_user: int
-    dof_jntid: int
-    dof_frictionloss: int
-    actuator_user: int
-    actuator_ctrlrange: int
-    ne: int
-    nf: int
-    nefc: int
-    nisland: int
-    ctrl: int
-    qvel: int
-    qfrc_spring: int
-    qfrc_applied: int
-    qfrc_bias: int
-    qfrc_actuator: int
-    actuator_length: int
-    actuator_velocity: int
-    ten_length: int
-    ten_velocity: int
-    efc_type: int
-    efc_id: int
-    efc_frictionloss: int
-    iefc_frictionloss: int
-    map_efc2iefc: int
+
+class _Places(_Named):
+    """Where the sizes and pointers that are used here lie in mjModel and mjData, in words of their own size."""
 
     @classmethod
     def found(cls) -> "_Places":
