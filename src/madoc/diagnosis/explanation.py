@@ -3,7 +3,6 @@
 from collections.abc import Collection
 from dataclasses import dataclass
 
-import jax
 import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 from scipy.stats import qmc
@@ -15,6 +14,7 @@ from madoc.identification.replay import window_residuals
 from madoc.identification.states import LoggedStates
 from madoc.identification.windows import Windows, drawn, horizons, longest_fit, rows_that_fit, windows_at
 from madoc.simulation.base import Simulator
+from madoc.types import generator
 
 WINDOWS = (16, 64)
 """Smallest and largest number of windows replayed."""
@@ -77,10 +77,9 @@ def explain(
 
 def box_draws(count: int, key: PRNGKeyArray) -> Float[np.ndarray, "draws d"]:
     """Mid-range, some corners of the box, and a scrambled Halton sequence inside it."""
-    of_corners, of_inside = jax.random.split(key)
-    corners = np.array(2.0 * jax.random.bernoulli(of_corners, 0.5, (CORNERS, count)) - 1.0, np.float64)
-    seed = int(jax.random.randint(of_inside, (), 0, 2**31 - 1))
-    inside = 2.0 * qmc.Halton(count, rng=np.random.default_rng(seed)).random(DRAWS) - 1.0
+    random = generator(key)
+    corners = 2.0 * random.integers(0, 2, (CORNERS, count)) - 1.0
+    inside = 2.0 * qmc.Halton(count, rng=random).random(DRAWS) - 1.0
     return np.concatenate([np.zeros((1, count)), np.unique(corners, axis=0), inside])
 
 
