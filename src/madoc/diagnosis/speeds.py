@@ -78,9 +78,18 @@ class _Pair:
 
 def speed_findings(dataset: Dataset, simulator: Simulator) -> tuple[list[Finding], bool]:
     """Findings on positions that do not change by speed times control step, and whether a speed comes late."""
+    pairs = _pairs(dataset, simulator)
+    findings, fits = _compared(pairs, simulator.control_step)
+    if fits and 2 * len(fits) >= len(pairs):
+        findings += _rate_findings(fits)
+    late = [pair_and_fit for pair_and_fit in fits if pair_and_fit[1].late]
+    return [*findings, *(_late_finding(*each) for each in late)], bool(late)
+
+
+def _compared(pairs: list[_Pair], control_step: float) -> tuple[list[Finding], list[tuple[_Pair, "_Fit"]]]:
+    """Findings of jumps and units, and fits of the pairs that have neither."""
     findings: list[Finding] = []
     fits: list[tuple[_Pair, _Fit]] = []
-    pairs = _pairs(dataset, simulator)
     for pair in pairs:
         turned = np.abs(np.abs(pair.change) - 2.0 * np.pi) < 0.1 * 2.0 * np.pi
         turned &= np.abs(pair.change - pair.expected) > np.pi
@@ -91,12 +100,9 @@ def speed_findings(dataset: Dataset, simulator: Simulator) -> tuple[list[Finding
         if ratio is not None and not _NEAR[0] < ratio < _NEAR[1]:
             findings.append(_unit_finding(pair, ratio))
         elif ratio is not None and not turned.any():
-            fit = _fitted(pair, simulator.control_step)
+            fit = _fitted(pair, control_step)
             fits += [] if fit is None else [(pair, fit)]
-    if fits and 2 * len(fits) >= len(pairs):
-        findings += _rate_findings(fits)
-    late = [pair_and_fit for pair_and_fit in fits if pair_and_fit[1].late]
-    return [*findings, *(_late_finding(*each) for each in late)], bool(late)
+    return findings, fits
 
 
 def rates_contradict(dataset: Dataset, simulator: Simulator, values: Float[np.ndarray, " parameters"]) -> bool:
@@ -106,8 +112,8 @@ def rates_contradict(dataset: Dataset, simulator: Simulator, values: Float[np.nd
     """
     within = _within_rows(dataset, simulator, values)
     pairs = [replace(pair, expected=pair.expected + within[:, pair.dof]) for pair in _pairs(dataset, simulator)]
-    fits = [(pair, fit) for pair in pairs if (fit := _fitted(pair, simulator.control_step)) is not None]
-    return not fits or bool(_rate_findings(fits))
+    fits = _compared(pairs, simulator.control_step)[1]
+    return 2 * len(fits) < len(pairs) or bool(_rate_findings(fits))
 
 
 def _within_rows(
@@ -119,8 +125,9 @@ def _within_rows(
     """
     states, rows = logged_states(dataset, simulator.task)
     system, size = simulator.bind(values), simulator.task.model.nv
-    after = system.step(states[None], np.asarray(dataset.transitions.action, np.float64)[None, rows])[0]
-    change, speeds = after[:, :size] - states[:, :size], (after + states)[:, size : 2 * size]
+    states = system.unbiased(states[None])
+    after = system.step(states, np.asarray(dataset.transitions.action, np.float64)[None, rows])
+    (change,), (speeds,) = (after - states)[..., :size], (after + states)[..., size : 2 * size]
     beyond = np.zeros((len(dataset), size))
     beyond[rows] = np.nan_to_num(change - 0.5 * speeds * simulator.control_step)
     return beyond

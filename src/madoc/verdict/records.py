@@ -278,7 +278,8 @@ def _best_half_widths(
     given = bench.problem.states, bench.problem.dataset, bench.problem.simulator, at
     residual = np.maximum(residual, NEGLIGIBLE) * bench.change[: len(residual)]
     values = 1 + 2 * len(at) + bench.states.physical_size
-    most = bench.windows_in_time(horizons(bench.problem.dataset)[-1] * values, NARROWEST, WINDOWS)
+    in_time = bench.windows_in_time(horizons(bench.problem.dataset)[-1] * values, NARROWEST, WINDOWS)
+    most = max(in_time, WINDOWS // 2)  # fewer may miss what is rare
     half = expected_half_widths(*given, residual, exact=exact, most=most)
     if sensors is None:
         return half
