@@ -57,7 +57,7 @@ class CalibrationResult:
     Attributes:
         method: Name of the method, as `madoc methods` lists it.
         task: Name of the task.
-        status: `finished` (the budget is spent), `converged`, `interrupted` or `diverged`.
+        status: `finished` (the budget is spent, or too little of it is left), `converged`, `interrupted` or `diverged`.
         sentence: The status in words.
         control_steps: Simulated control steps of any kind.
         seconds: Wall-clock time of the search.

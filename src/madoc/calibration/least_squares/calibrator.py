@@ -119,7 +119,7 @@ class LeastSquares:
 
     def step(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[LeastSquaresState, Epoch]:
         """Take one damped step of the current search, and decide which search goes on."""
-        began = SIMULATED.control_steps
+        began, windows = SIMULATED.control_steps, (state.stage, state.length)
         if state.prediction is not None and state.prediction.progress == "under way":
             prediction, epoch = predicting.step(problem, state.prediction)
             state = replace(state, prediction=prediction, finished=int(prediction.progress != "under way"))
@@ -140,7 +140,9 @@ class LeastSquares:
             search, epoch = self._known(problem).step(problem, state.known)
             state = self._then_predicting(problem, self._after_known(problem, replace(state, known=search)))
         converged = "another iteration would hardly change any estimate" if state.finished else None
-        spent, following = SIMULATED.control_steps - began, self._following(problem, state)
+        # The rate at which windows are simulated says little of that of other ones.
+        following = self._following(problem, state) if windows == (state.stage, state.length) else None
+        spent = SIMULATED.control_steps - began
         return state, replace(epoch, control_steps=spent, converged=converged, following=following)
 
     def _following(self, problem: CalibrationProblem, state: LeastSquaresState) -> int | None:

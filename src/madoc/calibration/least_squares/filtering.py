@@ -253,12 +253,12 @@ def of_contacts(
 
 
 def epoch_steps(problem: CalibrationProblem, state: FilterState) -> int:
-    """Control steps of the next epoch; where the search is at rest no step is tried."""
+    """Control steps of the next epoch, at most in the last one; where the search is at rest no step is tried."""
     members, tried = state.members, 0 if state.at_rest else 1 + len(TRIALS)
     few = (2 * 2 * len(problem.simulator.parameters) + tried) * FEW
     alone = 0 if state.wide else NOISE_ROUNDS * members
     if state.at_rest and state.to_compare == 1:
-        alone += LARGE_ROUNDS * LARGE
+        alone += (LARGE_ROUNDS + 1) * LARGE
     windows = len(state.rows[state.block])
     return (alone * min(windows, state.size) + (2 * members + few) * windows) * state.horizon
 
@@ -305,12 +305,13 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
         if following.settled:
             some = np.arange(min(state.size, len(rows)))
             fewer = *log[:3], readings.of(some), rows[some]
-            found, noise = with_noise(*fewer, state.point, state.noise, rounding, LARGE, LARGE_ROUNDS, random[2])
+            _, known = with_noise(*fewer, state.point, state.noise, rounding, LARGE, LARGE_ROUNDS - 1, random[2])
+            found, noise = with_noise(*fewer, state.point, known, rounding, LARGE, 1, random[2])
             costs = surprises(found, loss)
             if (lost := np.flatnonzero(costs > LONG_TAILS)).size:
                 # An ensemble may lose what it follows by chance. What the model lacks surprises another one as well.
                 again = *log[:3], readings.of(lost), rows[lost]
-                other, _ = with_noise(*again, state.point, noise, rounding, LARGE, 1, random[2])
+                other, _ = with_noise(*again, state.point, known, rounding, LARGE, 1, random[2])
                 costs[lost] = np.minimum(costs[lost], surprises(other, loss))
             following = replace(following, noise=noise, cost=over_windows(costs), alike=found.alike())
         return following, Epoch({"moved": state.moved})
