@@ -1,6 +1,7 @@
 """Pictures by MuJoCo's renderer where OpenGL is to be had, outlines where it is broken, and the camera by hand."""
 
 import ctypes.util
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -53,6 +54,12 @@ def test_a_rod_that_hangs_and_one_that_lies(model, way):
     assert [is_tall(seen(picture)[0]) for picture in drawn] == [True, False]
     red, green, blue = seen(drawn[0])[1]
     assert (red > 2 * max(green, blue)) if way == "MuJoCo" else (blue > red)
+
+
+def test_panels_stand_in_their_order(model, way):
+    two = replace(CAMERA, centre=np.repeat(CAMERA.centre[:, :1], 2, axis=0))
+    drawn = pictures(model, np.array([[HANGS], [LIES]]), two, width=80, height=60)
+    assert [is_tall(seen(panel[0])[0]) for panel in drawn] == [True, False]
 
 
 def test_a_ghost_shines_where_it_is_and_a_failed_simulation_is_nowhere(model, way):

@@ -23,7 +23,9 @@ from madoc.simulation.outlines import outlines
 LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}
 """The ways to OpenGL without a screen, as MuJoCo's `MUJOCO_GL` names them, and the library that each needs."""
 TIMEOUT = 30.0
-"""Longest time in s that drawing may take with each of them."""
+"""Longest time in s that drawing may take with each of them, after which it is stopped."""
+DRAWING = 8.0
+"""Time in s that drawing may take; where it takes longer, some pictures stand for those after them."""
 PAPER, BODY, GHOST = (255, 255, 255), ((31, 111, 214), 230), ((13, 153, 102), 100)
 """Colours of outlines: what is behind them, and their own with an opacity of 255."""
 
@@ -144,13 +146,13 @@ def _ways() -> list[str]:
 def _draw(folder: Path, way: str, panels: int) -> bool:
     """Let a process for each panel draw what the folder asks; whether all did."""
     words = [sys.executable, "-P", str(Path(__file__).with_name("render_process.py")), str(folder)]
-    environment = os.environ | {"MUJOCO_GL": way, "PYOPENGL_PLATFORM": way}
+    environment, turns = os.environ | {"MUJOCO_GL": way, "PYOPENGL_PLATFORM": way}, -(-panels // usable_cores())
 
     def drawn(panel: int) -> bool:
         with contextlib.suppress(subprocess.TimeoutExpired):
-            asked = [*words, str(panel)]
+            asked, limit = [*words, str(panel), str(DRAWING / turns)], TIMEOUT / turns
             done = subprocess.run(
-                asked, env=environment, timeout=TIMEOUT, stdin=subprocess.DEVNULL, capture_output=True, check=False
+                asked, env=environment, timeout=limit, stdin=subprocess.DEVNULL, capture_output=True, check=False
             )
             return done.returncode == 0
         return False

@@ -9,14 +9,12 @@ import numpy as np
 
 PAPER, GHOST = (1.0, 1.0, 1.0, 1.0), (0.05, 0.6, 0.4, 0.4)
 """Colours of what is behind a robot, and of a robot that is seen through."""
-SECONDS = 8.0
-"""Time in s that drawing may take; where it takes longer, some pictures stand for those after them."""
 ELEVATION = -8.0
 """Angle of view above the horizontal, deg."""
 
 
-def main(folder: Path, panel: int) -> None:
-    """Draw a panel of `asked.npz` of `model.mjb` into `panel_N.npy`."""
+def main(folder: Path, panel: int, seconds: float) -> None:
+    """Draw a panel of `asked.npz` of `model.mjb` into `panel_N.npy`, in about so many seconds at most."""
     model = mujoco.MjModel.from_binary_path(str(folder / "model.mjb"))
     with np.load(folder / "asked.npz", allow_pickle=False) as file:
         asked = dict(file)
@@ -47,7 +45,7 @@ def main(folder: Path, panel: int) -> None:
             _add_paper(camera, renderer.scene)
             drawn[frame] = renderer.render().reshape(height, 2, width, 2, 3).mean((1, 3))
             if frame == 1:  # the first loads the model's meshes
-                every = int(np.ceil((time.monotonic() - began) * len(states) / SECONDS))
+                every = int(np.ceil((time.monotonic() - began) * len(states) / seconds))
     np.save(folder / f"panel_{panel}.npy", drawn)
 
 
@@ -84,4 +82,4 @@ def _add_paper(camera: mujoco.MjvCamera, scene: mujoco.MjvScene) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), int(sys.argv[2]))
+    main(Path(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3]))
