@@ -97,7 +97,7 @@ class Epoch:
         stage: The kind of the epoch in a word, such as `cloning`.
         fraction: Share of the preparation that is done, if the epoch prepares and spends none of the budget.
         converged: The reason in a sentence, once the method has stopped by itself.
-        following: About how many control steps the next step simulates, if the method knows.
+        following: About how many control steps the next step simulates, if the method knows, and they are like these.
     """
 
     metrics: Metrics = field(default_factory=dict)

@@ -317,7 +317,10 @@ def test_a_step_that_would_outlast_the_time_is_not_begun(tmp_path):
     ahead = Wander(seconds=0.05, cloning=0, following=10_000)  # a thousand times the first step, of at least 0.05 s
     first = in_folder(tmp_path / "run", method=ahead, budget=Seconds(30.0))
     assert (first.status, first.control_steps) == ("finished", 10)
-    assert re.fullmatch(r"\d+ of 30 s are spent, and the next step takes about \d+ s", first.sentence)
+    words = r"\d+ of 30 s are spent, and too little is left for the next step, of about \S+ s; give it a larger budget"
+    assert re.fullmatch(words, first.sentence)
     again = in_folder(tmp_path / "run", method=ahead, budget=Seconds(30.0), resume=True)
     assert (again.control_steps, again.sentence) == (first.control_steps, first.sentence)
     assert in_folder(tmp_path / "count", method=ahead, budget=30).control_steps == 30
+    fits = Wander(seconds=0.05, cloning=0, following=10, converged_epoch=3)
+    assert in_folder(tmp_path / "fits", method=fits, budget=Seconds(30.0)).status == "converged"

@@ -67,7 +67,8 @@ class Finished(Generic[State]):
     Attributes:
         state: The last state; of a run that diverged, that of the last checkpoint. Without a folder it is that of the
             time when one was due, and buffers that are written in place are not to be read.
-        status: `finished` (the budget is spent), `converged`, `interrupted` (by the user) or `diverged` (a NaN).
+        status: `finished` (the budget is spent, or too little of it is left), `converged`, `interrupted` (by the user)
+            or `diverged` (a NaN).
         sentence: The status in words.
         control_steps: Simulated control steps.
         updates: Gradient updates of the result.
@@ -108,7 +109,8 @@ def run(
         method: The method.
         problem: The problem that its functions are given.
         key: The only source of randomness; a resumed run needs the same key.
-        budget: A count in `unit`, or a time as `Seconds(300)` or "300s"; the step that reaches it is the last. A run
+        budget: A count in `unit`, or a time as `Seconds(300)` or "300s"; the step that reaches it is the last, and one
+            that would outlast a time by more than `OVER` of it is not begun. A run
             under a time budget that is killed and resumed has the time that was left at the checkpoint, and its result
             depends on the machine's speed.
         folder: The folder for logs, checkpoints and `result.json`; None to write nothing.
@@ -240,8 +242,8 @@ class _Session(Generic[State]):
             elif self._share >= 1.0:
                 self.outcome = "finished", f"the budget of {self._allowed} is spent"
             elif not self._fits:
-                about = f"the next step takes about {self._ahead:.0f} s"
-                self.outcome = "finished", f"{self._used} of {self._allowed} are spent, and {about}"
+                left = f"too little is left for the next step, of about {self._ahead:.2g} s; give it a larger budget"
+                self.outcome = "finished", f"{self._used} of {self._allowed} are spent, and {left}"
             elif interrupted:
                 self.outcome = "interrupted", f"interrupted at {self._used} of {self._allowed}"
         return self.outcome is not None
