@@ -140,10 +140,9 @@ class LeastSquares:
             search, epoch = self._known(problem).step(problem, state.known)
             state = self._then_predicting(problem, self._after_known(problem, replace(state, known=search)))
         converged = "another iteration would hardly change any estimate" if state.finished else None
-        # The rate at which windows are simulated says little of that of other ones.
         following = self._following(problem, state) if windows == (state.stage, state.length) else None
-        spent = SIMULATED.control_steps - began
-        return state, replace(epoch, control_steps=spent, converged=converged, following=following)
+        steps = SIMULATED.control_steps - began
+        return state, replace(epoch, control_steps=steps, converged=converged, following=following)
 
     def _following(self, problem: CalibrationProblem, state: LeastSquaresState) -> int | None:
         """About how many control steps the next step simulates; None once it fits predictions, and at the end."""
