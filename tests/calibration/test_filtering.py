@@ -380,7 +380,7 @@ def test_an_epoch_at_rest_tells_what_half_the_ensemble_errs_and_moves_nothing(tm
     assert spent == (systems * len(search.rows) + large) * filtering.horizon_of(problem)
 
 
-def test_only_what_two_ensembles_lose_counts_as_lost(tmp_path, monkeypatch):
+def test_only_what_a_larger_ensemble_loses_too_counts_as_lost(tmp_path, monkeypatch):
     problem = problem_of_foot(tmp_path)
     search = of_contacts(problem, jax.random.key(0))
     told = np.broadcast_to(np.eye(2), (len(search.rows), 2, 2))
@@ -388,7 +388,7 @@ def test_only_what_two_ensembles_lose_counts_as_lost(tmp_path, monkeypatch):
     asked = []
 
     def by_hand(found, loss):
-        """One ensemble loses the third window and the fifth, and fails in the sixth; the other loses the fifth."""
+        """An ensemble loses the third window and the fifth, and fails in the sixth; a larger one loses the fifth."""
         asked.append(len(found.mean[0]))
         costs = np.full(search.size, 0.5)
         costs[[2, 4, 5]] = 9.0, 9.0, np.inf
@@ -399,7 +399,7 @@ def test_only_what_two_ensembles_lose_counts_as_lost(tmp_path, monkeypatch):
     assert asked == [search.size, 3]
     assert after.cost == pytest.approx((0.5 * (search.size - 2) + 7.0) / (search.size - 1))
     systems = filtering.MEMBERS + 2 * 2 * len(problem.simulator.parameters) * instruments.FEW
-    large = filtering.LARGE * (filtering.LARGE_ROUNDS * search.size + 3)
+    large = filtering.LARGE * (filtering.LARGE_ROUNDS * search.size + filtering.LARGER * 3)
     assert spent == (systems * len(search.rows) + large) * filtering.horizon_of(problem)
     one = known(np.array([[[[2.0], [0.0]], [[1.0], [0.0]]]]))  # of two windows of two readings, one channel
     failed = replace(one, whole=np.array([[True, False]]))

@@ -52,9 +52,9 @@ WIDTH = 0.1
 """Width of a difference in [-1, 1] to either side at first; later it is by what is known of parameters, `axes_of`."""
 MEMBERS = 32
 """Number of states in an ensemble; the last epochs, with half as many, tell what a finite one errs."""
-LARGE, LARGE_ROUNDS = 64, 2
+LARGE, LARGE_ROUNDS, LARGER = 64, 2, 4
 """Number of states that tell at the end whether what is left is noise, as few leave errors that are alike, and how
-often noise is estimated by them. What one such ensemble loses is asked of another."""
+often noise is estimated by them. Windows that such an ensemble loses are given to one so many times as large."""
 LONGEST = 0.5
 """Largest change of a parameter in an epoch, in [-1, 1]."""
 DAMPED = 10.0
@@ -253,12 +253,12 @@ def of_contacts(
 
 
 def epoch_steps(problem: CalibrationProblem, state: FilterState) -> int:
-    """Control steps of the next epoch, at most in the last one; where the search is at rest no step is tried."""
+    """Control steps of the next epoch, but for windows lost in the last one; at rest no step is tried."""
     members, tried = state.members, 0 if state.at_rest else 1 + len(TRIALS)
     few = (2 * 2 * len(problem.simulator.parameters) + tried) * FEW
     alone = 0 if state.wide else NOISE_ROUNDS * members
     if state.at_rest and state.to_compare == 1:
-        alone += (LARGE_ROUNDS + 1) * LARGE
+        alone += LARGE_ROUNDS * LARGE
     windows = len(state.rows[state.block])
     return (alone * min(windows, state.size) + (2 * members + few) * windows) * state.horizon
 
@@ -309,10 +309,10 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
             found, noise = with_noise(*fewer, state.point, known, rounding, LARGE, 1, random[2])
             costs = surprises(found, loss)
             if (lost := np.flatnonzero(costs > LONG_TAILS)).size:
-                # An ensemble may lose what it follows by chance. What the model lacks surprises another one as well.
+                # An ensemble may lose what it follows by chance. What the model lacks surprises a larger one as well.
                 again = *log[:3], readings.of(lost), rows[lost]
-                other, _ = with_noise(*again, state.point, known, rounding, LARGE, 1, random[2])
-                costs[lost] = np.minimum(costs[lost], surprises(other, loss))
+                larger, _ = with_noise(*again, state.point, known, rounding, LARGER * LARGE, 1, random[2])
+                costs[lost] = np.minimum(costs[lost], surprises(larger, loss))
             following = replace(following, noise=noise, cost=over_windows(costs), alike=found.alike())
         return following, Epoch({"moved": state.moved})
     together = state.together + 1 if state.near else 0
