@@ -113,7 +113,7 @@ def rates_contradict(dataset: Dataset, simulator: Simulator, values: Float[np.nd
     within = _within_rows(dataset, simulator, values)
     pairs = [replace(pair, expected=pair.expected + within[:, pair.dof]) for pair in _pairs(dataset, simulator)]
     fits = _compared(pairs, simulator.control_step)[1]
-    return 2 * len(fits) < len(pairs) or bool(_rate_findings(fits))
+    return not fits or 2 * len(fits) < len(pairs) or bool(_rate_findings(fits))
 
 
 def _within_rows(

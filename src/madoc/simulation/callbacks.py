@@ -236,16 +236,15 @@ def _function(name: str) -> Any:
     return function
 
 
-_Named = namedtuple(
-    "_Named",
-    "nu nv njnt nuser_jnt nuser_actuator jnt_user dof_jntid dof_frictionloss actuator_user actuator_ctrlrange "
-    "ne nf nefc nisland ctrl qvel qfrc_spring qfrc_applied qfrc_bias qfrc_actuator actuator_length "
-    "actuator_velocity ten_length ten_velocity efc_type efc_id efc_frictionloss iefc_frictionloss "
-    "map_efc2iefc",
-)
-
-
-class _Places(_Named):
+class _Places(
+    namedtuple(
+        "_Places",
+        "nu nv njnt nuser_jnt nuser_actuator jnt_user dof_jntid dof_frictionloss actuator_user actuator_ctrlrange "
+        "ne nf nefc nisland ctrl qvel qfrc_spring qfrc_applied qfrc_bias qfrc_actuator actuator_length "
+        "actuator_velocity ten_length ten_velocity efc_type efc_id efc_frictionloss iefc_frictionloss "
+        "map_efc2iefc",
+    )
+):
     """Where the sizes and pointers that are used here lie in mjModel and mjData, in words of their own size."""
 
     @classmethod

@@ -158,4 +158,4 @@ def _draw(folder: Path, way: str, panels: int) -> bool:
         return False
 
     with ThreadPoolExecutor(usable_cores()) as pool:
-        return all(list(pool.map(drawn, range(panels))))
+        return all(pool.map(drawn, range(panels)))

@@ -123,8 +123,7 @@ class LeastSquares:
         if state.prediction is not None and state.prediction.progress == "under way":
             prediction, epoch = predicting.step(problem, state.prediction)
             state = replace(state, prediction=prediction, finished=int(prediction.progress != "under way"))
-        elif state.stage == "filtering":
-            assert state.filtered is not None
+        elif state.stage == "filtering" and state.filtered is not None:
             by_filter, epoch = filtering.step(problem, state.filtered, self.loss)
             state = after_filter(problem, replace(state, filtered=by_filter), self._unknown(problem).horizon)
         elif state.estimates_starts:
@@ -140,13 +139,13 @@ class LeastSquares:
             search, epoch = self._known(problem).step(problem, state.known)
             state = self._then_predicting(problem, self._after_known(problem, replace(state, known=search)))
         converged = "another iteration would hardly change any estimate" if state.finished else None
-        following = self._following(problem, state) if windows == (state.stage, state.length) else None
-        steps = SIMULATED.control_steps - began
+        steps, following = SIMULATED.control_steps - began, self._following(problem, state, windows)
         return state, replace(epoch, control_steps=steps, converged=converged, following=following)
 
-    def _following(self, problem: CalibrationProblem, state: LeastSquaresState) -> int | None:
-        """About how many control steps the next step simulates; None once it fits predictions, and at the end."""
-        if state.finished or (state.prediction is not None and state.prediction.progress == "under way"):
+    def _following(self, problem: CalibrationProblem, state: LeastSquaresState, was: tuple[Stage, int]) -> int | None:
+        """About how many control steps the next step simulates, where windows are of the same kind as they were."""
+        prediction = state.prediction is not None and state.prediction.progress == "under way"
+        if state.finished or prediction or was != (state.stage, state.length):
             return None
         if state.stage == "filtering" and state.filtered is not None:
             return filtering.epoch_steps(problem, state.filtered)
