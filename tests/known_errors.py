@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from madoc.identification.ensembles import Correction, Innovations
+from madoc.identification.innovations import Correction, Innovations
 
 
 def known(errors):
@@ -10,4 +10,7 @@ def known(errors):
     rows, channels = errors.shape[1:-1], errors.shape[-1]
     one, none = np.broadcast_to(np.eye(channels), (*rows, channels, channels)), np.zeros((*rows, 1, channels))
     correction = Correction(one, one, none, none, np.ones((*rows, channels)))
-    return Innovations(errors, correction, np.ones(errors.shape[:2], bool), errors, 0)
+    nothing = np.zeros((*errors.shape[1:3], 0))
+    return Innovations(
+        errors, correction, np.ones(errors.shape[:2], bool), errors, 0, np.ones(channels), nothing, nothing
+    )

@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import mujoco
+import numpy as np
 
 from madoc import simulation
 from madoc.data.record import record
@@ -162,12 +163,37 @@ ARM_TRUTH = {
 }
 
 
-def recorded(task: Task, truth: dict[str, float], rows: int, key):
-    """A log of so many rows under a random policy, with the truth that it travels with."""
+def recorded(task: Task, truth: dict[str, float], rows: int, key, force: float = 0.0):
+    """A log of so many rows under a random policy, with the truth that it travels with.
+
+    Random forces act meanwhile, of this standard deviation on every degree of freedom.
+    """
     simulator = simulation.make(task, threads=1)
+    simulator = PushedSimulator(simulator, force) if force else simulator
     of_policy, of_rollout = jax.random.split(key)
     policy = TanhGaussianPolicy(task.observation_size, simulator.action_size, (16,), key=of_policy)
     return record(policy, simulator, truth, transitions=rows, key=of_rollout, origin="a random policy")
+
+
+class PushedSimulator:
+    """A simulator in which random forces act on every degree of freedom in each control step."""
+
+    def __init__(self, simulator, force: float):
+        self._simulator, self._force = simulator, force
+
+    def __getattr__(self, name):
+        return getattr(self._simulator, name)
+
+    def bind(self, parameters):
+        system, random = self._simulator.bind(parameters), np.random.default_rng(0)
+        step = system.step
+
+        def pushed(state, action):
+            dofs = self._simulator.task.model.nv
+            return step(state, action, self._force * random.standard_normal((*action.shape[:-1], dofs)))
+
+        system.step = pushed
+        return system
 
 
 class CountingSimulator:

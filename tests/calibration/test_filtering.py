@@ -8,10 +8,13 @@ import pytest
 
 from madoc import robots, simulation
 from madoc.calibration import CalibrationProblem
-from madoc.calibration.least_squares import filtering, instruments
+from madoc.calibration.least_squares import filter_state, filtering, instruments, remainder
 from madoc.calibration.least_squares.calibrator import LeastSquares
 from madoc.calibration.least_squares.filtering import of_contacts
 from madoc.calibration.least_squares.instruments import Side, agreed, axes_of
+from madoc.calibration.least_squares.lengthening import LeastSquaresState, back_to_filter
+from madoc.calibration.least_squares.sentences import about_surprises
+from madoc.identification import random_forces
 from madoc.identification.ensembles import (
     BEFORE,
     DRAWN,
@@ -60,10 +63,11 @@ FOOT_TRUTH = {"friction": 0.4, "mass": 0.8}
 NOISE = {"along": 5e-4, "up": 5e-4, "along_speed": 5e-3, "up_speed": 5e-3}
 
 
-def problem_of_foot(folder, rows=900, spec=FOOT_SPEC):
-    """A log whose heights are as noisy as a camera's, many times as deep as the foot sinks in."""
+def problem_of_foot(folder, rows=900, spec=FOOT_SPEC, force=0.0):
+    """A log whose heights are as noisy as a camera's, many times as deep as the foot sinks in; a random force acts."""
     task = robots.load(write_robot(folder, spec, foot=FOOT)).task
-    log = recorded(task, {"action_delay": 0.01, **FOOT_TRUTH} if task.pending else FOOT_TRUTH, rows, jax.random.key(0))
+    truth = {"action_delay": 0.01, **FOOT_TRUTH} if task.pending else FOOT_TRUTH
+    log = recorded(task, truth, rows, jax.random.key(0), force)
     random, logged = np.random.default_rng(0), log.transitions
     here, there = (np.array(part, np.float64) for part in (logged.observation, logged.next_observation))
     error = random.standard_normal((len(here) + 1, 4)) * [*NOISE.values()]
@@ -195,8 +199,8 @@ def test_an_epoch_at_rest_tells_what_half_the_ensemble_errs_and_moves_nothing(tm
     assert (search.blocks, len(search.rows)) == (1, 42)
     told = np.broadcast_to(np.eye(2), (len(search.rows), 2, 2))
     truth = problem.simulator.parameters.to_unit(problem.simulator.parameters.vector(FOOT_TRUTH))
-    rest = replace(search, point=truth, wide=3, quiet=1, together=filtering.TOGETHER, squares=told)
-    assert rest.at_rest and not rest.settled and rest.members == filtering.MEMBERS // 2
+    rest = replace(search, point=truth, wide=3, quiet=1, together=filter_state.TOGETHER, squares=told)
+    assert rest.at_rest and not rest.settled and rest.members == filter_state.MEMBERS // 2
     (after, _), spent = counted(filtering.step, problem, rest, "cauchy")
     assert after.settled
     np.testing.assert_array_equal(after.point, rest.point)
@@ -204,8 +208,8 @@ def test_an_epoch_at_rest_tells_what_half_the_ensemble_errs_and_moves_nothing(tm
     known_well = replace(after, apart=np.array([1.0, 2.0]), compared=0, products=1e3 * told, squares=1e3 * told)
     covariance = known_well.found.uncertainty.covariance  # of one gradient alone, as there was no scatter before
     np.testing.assert_allclose(covariance, np.array([[1.0, 2.0], [2.0, 4.0]]) / (1e3 * len(told)) ** 2)
-    systems = filtering.MEMBERS + 2 * 2 * len(problem.simulator.parameters) * instruments.FEW
-    large = filtering.LARGE_ROUNDS * filtering.LARGE * search.size
+    systems = filter_state.MEMBERS + 2 * 2 * len(problem.simulator.parameters) * instruments.FEW
+    large = remainder.LARGE_ROUNDS * remainder.LARGE * search.size
     assert spent == (systems * len(search.rows) + large) * filtering.horizon_of(problem)
 
 
@@ -213,7 +217,7 @@ def test_only_what_a_larger_ensemble_loses_too_counts_as_lost(tmp_path, monkeypa
     problem = problem_of_foot(tmp_path)
     search = of_contacts(problem, jax.random.key(0))
     told = np.broadcast_to(np.eye(2), (len(search.rows), 2, 2))
-    rest = replace(search, wide=3, quiet=1, together=filtering.TOGETHER, squares=told)
+    rest = replace(search, wide=3, quiet=1, together=filter_state.TOGETHER, squares=told)
     asked = []
 
     def by_hand(found, loss):
@@ -223,13 +227,37 @@ def test_only_what_a_larger_ensemble_loses_too_counts_as_lost(tmp_path, monkeypa
         costs[[2, 4, 5]] = 9.0, 9.0, np.inf
         return costs if len(asked) == 1 else np.array([0.5, 7.0, np.inf])
 
-    monkeypatch.setattr(filtering, "surprises", by_hand)
+    monkeypatch.setattr(remainder, "surprises", by_hand)
     (after, _), spent = counted(filtering.step, problem, rest, "cauchy")
     assert asked == [search.size, 3]
     assert after.cost == pytest.approx((0.5 * (search.size - 2) + 7.0) / (search.size - 1))
-    systems = filtering.MEMBERS + 2 * 2 * len(problem.simulator.parameters) * instruments.FEW
-    large = filtering.LARGE * (filtering.LARGE_ROUNDS * search.size + filtering.LARGER * 3)
+    systems = filter_state.MEMBERS + 2 * 2 * len(problem.simulator.parameters) * instruments.FEW
+    large = remainder.LARGE * (remainder.LARGE_ROUNDS * search.size + remainder.LARGER * 3)
     assert spent == (systems * len(search.rows) + large) * filtering.horizon_of(problem)
+
+
+def test_random_forces_are_looked_for_where_errors_last_and_are_found(tmp_path):
+    """A force of 0.4 N; the inertia that the model has, before it is calibrated, is 1 kg."""
+    problem = problem_of_foot(tmp_path, force=0.4)
+    search = of_contacts(problem, jax.random.key(0))
+    told = np.broadcast_to(np.eye(2), (len(search.rows), 2, 2))
+    truth = problem.simulator.parameters.to_unit(problem.simulator.parameters.vector(FOOT_TRUTH))
+    rest = replace(search, point=truth, wide=3, quiet=1, together=filter_state.TOGETHER, squares=told, halved=9)
+    assert rest.settled and not remainder.may_be_pushed(replace(rest, alike=remainder.LASTING))
+    state = LeastSquaresState(None, (), "filtering", replace(rest, alike=0.11), None)
+    asked = back_to_filter(state)
+    assert asked.filtered.forces == 1 and not asked.filtered.settled and not asked.finished
+    (found, _), spent = counted(filtering.step, problem, asked.filtered, "cauchy")
+    assert spent == filtering.epoch_steps(problem, asked.filtered)
+    assert found.force == pytest.approx(0.4, rel=0.25) and not found.settled and not found.squares.any()
+    done = replace(found, together=filter_state.TOGETHER, moved=0.0, quiet=1, halved=9, squares=told, alike=0.9)
+    assert done.settled and back_to_filter(replace(state, filtered=done)).finished  # they are looked for once
+    np.testing.assert_allclose(random_forces.by_dof(problem.simulator, found.force), found.force * np.ones(2))
+    (warning,) = about_surprises(problem, replace(done, alike=0.0))
+    assert f"about {found.force:.2g} to {found.force:.2g} N or N·m" in warning
+    without = problem_of_foot(tmp_path)
+    (none, _), _ = counted(filtering.step, without, replace(asked.filtered, size=12), "cauchy")
+    assert none.force == 0.0 and none.settled and none.forces == 2
 
 
 def test_epochs_near_the_end_take_other_windows_and_count_together(tmp_path):
@@ -243,7 +271,7 @@ def test_epochs_near_the_end_take_other_windows_and_count_together(tmp_path):
     assert replace(near, quiet=1, moved=0.5).block == slice(64, None)
     kept, fresh = np.arange(6.0), np.array([9.0, 9.0])
     np.testing.assert_allclose(filtering._counted(kept, fresh, slice(2, 4), 2), [0.0, 1.0, 5.5, 6.0, 4.0, 5.0])
-    assert replace(near, quiet=1, together=5, moved=0.99 * filtering.NEAR).near  # what one of them says counts less
-    far = replace(near, quiet=1, moved=filtering.NEAR)
+    assert replace(near, quiet=1, together=5, moved=0.99 * filter_state.NEAR).near  # what one of them says counts less
+    far = replace(near, quiet=1, moved=filter_state.NEAR)
     fresh_start, _ = filtering.step(problem, far, "cauchy")
     assert fresh_start.together == 0 and not fresh_start.gradients[32:].any()

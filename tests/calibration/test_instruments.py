@@ -25,7 +25,7 @@ class Given(Side):
 
 def given(errors, slopes):
     nothing, nowhere = known(np.zeros((1, len(errors), 1, 1))), np.zeros(slopes.shape[-1])
-    return Given(nothing.members, nothing, nothing, np.diag(nowhere), nowhere, (errors, slopes))
+    return Given(nothing.members, nothing, nothing, np.diag(nowhere), nowhere, None, (errors, slopes))
 
 
 def test_chance_biases_no_product_of_two_ensembles():
@@ -93,7 +93,7 @@ def test_errors_are_the_mean_over_both_ends_and_lead_back_to_the_point(above, be
     errors = np.concatenate([each.mean for each in ends])
     both = replace(point, mean=errors, whole=np.ones((2, 1), bool), members=errors)
     apart, aside = np.array([[above - below]]), np.array([(above + below) / 2.0])
-    side = Side(np.zeros((1, 1, 1)), point, both, apart, aside)
+    side = Side(np.zeros((1, 1, 1)), point, both, apart, aside, None)
     np.testing.assert_allclose(side.slopes(), [[[3.0 + above + below]]])
     np.testing.assert_allclose(side.errors(), [[mean]])
     np.testing.assert_allclose(side.found.counted(side.found.whitened[0]), [[2.0]])

@@ -129,6 +129,8 @@ class Estimate:
         unlike_noise: Whether residuals have longer tails than noise has, or each is like the next: the model does not
             explain the log, and the intervals do not count that. False where the method does not estimate the noise.
         effective: Whether the model leaves more than noise, and the estimate is the one that predicts best with it.
+        random_forces: Standard deviation of random forces on each degree of freedom, in N or N·m, a new one in each
+            control step, that act on the machine beside what the model has; empty where none were found.
         group_stability: Mean adjusted Rand index of the groups with those found from resampled states, or proposed in
             other epochs; 1 is the same groups, 0 chance. None where groups were not found from the problem.
     """
@@ -145,6 +147,7 @@ class Estimate:
     settled: bool = True
     unlike_noise: bool = False
     effective: bool = False
+    random_forces: Float[np.ndarray, " dof"] = field(default_factory=lambda: np.zeros(0))
     group_stability: float | None = None
 
 

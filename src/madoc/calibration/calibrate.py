@@ -94,6 +94,7 @@ def calibrate(
         settled=estimate.settled,
         unlike_noise=estimate.unlike_noise,
         effective=estimate.effective,
+        random_forces=estimate.random_forces.tolist(),
         group_stability=estimate.group_stability,
         problem=problem,
     )

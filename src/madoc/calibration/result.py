@@ -73,6 +73,8 @@ class CalibrationResult:
         settled: False where the method can tell that its search is not at its end; its intervals mean nothing before.
         unlike_noise: Whether residuals have longer tails than noise has, or each is like the next.
         effective: Whether the model leaves more than noise, and the estimate is the one that predicts best with it.
+        random_forces: Standard deviation of random forces on each degree of freedom, in N or N·m, a new one in each
+            control step, that act on the machine beside what the model has; empty where none were found.
         group_stability: How alike groups of resampled states are: their mean adjusted Rand index, 1 for the same
             groups, 0 for chance; None where the method did not find groups.
         chosen: Why `auto` took this method, in a sentence; None where the method was named.
@@ -100,6 +102,7 @@ class CalibrationResult:
     settled: bool = True
     unlike_noise: bool = False
     effective: bool = False
+    random_forces: list[float] = field(default_factory=list)
     judging_seconds: float = field(default=0.0, compare=False)
     group_stability: float | None = None
     chosen: str | None = None

@@ -6,31 +6,27 @@ says nothing of that around it. An ensemble of states that are all as likely as 
 smooth in the parameters, and what contacts forget of the first state it forgets as well.
 """
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from madoc.data.dataset import Dataset
 from madoc.data.disturbing import hide_velocities
 from madoc.data.timescale import stride
 from madoc.data.velocities import moving_states
-from madoc.identification.losses import Loss
+from madoc.identification.innovations import Innovations, innovations
 from madoc.identification.noise import difference_noise
+from madoc.identification.random_forces import by_dof, drawn
 from madoc.identification.replay import Readings
-from madoc.identification.settling import FAILED_WINDOW, settled_to_noise, window_costs
+from madoc.identification.settling import settled_to_noise, window_costs
 from madoc.identification.states import LoggedStates, completed
-from madoc.simulation.attitudes import differences, moved
+from madoc.simulation.attitudes import moved
 from madoc.simulation.base import Simulator
 
-FARTHEST = 4.0
-"""Standard deviations of an innovation, beyond which the states follow it no farther: a false reading says nothing."""
 NOISE_CHANGE = (0.1, 4.0)
 """Smallest and largest factor of a channel's noise variance from a run of the filter to the next."""
-CLIP, OF_CLIPPED = 3.0, 0.9950
-"""Standard deviations at which errors are clipped, and the mean square of a normal value that is."""
 OF_BASES = (0.003, 0.05)
 """Standard deviations in m and m/s of the places and speeds that contacts give bases which no sensor shows."""
 BEFORE, MOST_BEFORE = 8, 30
@@ -44,163 +40,6 @@ LEAST_NOISE = 1e-3
 SPOILT = 3
 """Number of first steps whose errors do not count. States are drawn about single readings, in which noise decides what
 touches, and velocities that are differences hold the next position; some steps of the filter put that right."""
-_SMALLEST = 1e-100
-
-
-class Correction(NamedTuple):
-    """How an ensemble's states follow the readings of a step, with L Lᵀ = S the covariance of their predictions.
-
-    Attributes:
-        factor: Lower triangular L, in standard deviations of the sensors' noise, that noise included.
-        inverse: L⁻¹.
-        gain: P Hᵀ L⁻ᵀ, by which the mean moves: Kalman's gain is K = P Hᵀ S⁻¹.
-        shrinking: P Hᵀ L⁻ᵀ (L + 1)⁻¹, by which deviations do: they then have the covariance (1 - K H) P (Andrews 1968).
-        share: Share in [0, 1] of L⁻¹ (prediction - reading) that is followed: not what is farther than `FARTHEST`.
-    """
-
-    factor: Float[np.ndarray, "*rows channels channels"]
-    inverse: Float[np.ndarray, "*rows channels channels"]
-    gain: Float[np.ndarray, "*rows physical channels"]
-    shrinking: Float[np.ndarray, "*rows physical channels"]
-    share: Float[np.ndarray, "*rows channels"]
-
-    @classmethod
-    def of(
-        cls,
-        states: Float[np.ndarray, "*rows members physical"],
-        apart: Float[np.ndarray, "*rows members channels"],
-    ) -> "Correction":
-        """That of an ensemble which is so far `apart` from a reading, in standard deviations of its noise."""
-        around, observed = states - states.mean(-2, keepdims=True), apart.mean(-2, keepdims=True)
-        shown, freedom, one = apart - observed, states.shape[-2] - 1, np.eye(apart.shape[-1])
-        factor = np.linalg.cholesky(np.swapaxes(shown, -1, -2) @ shown / freedom + one)
-        inverse = np.linalg.inv(factor)
-        gain = np.swapaxes(around, -1, -2) @ shown / freedom @ np.swapaxes(inverse, -1, -2)
-        far = np.abs(observed @ np.swapaxes(inverse, -1, -2))[..., 0, :]
-        return cls(factor, inverse, gain, gain @ np.linalg.inv(factor + one), FARTHEST / np.maximum(far, FARTHEST))
-
-    def follow(
-        self,
-        states: Float[np.ndarray, "*systems_and_rows members physical"],
-        apart: Float[np.ndarray, "*systems_and_rows members channels"],
-    ) -> Float[np.ndarray, "*systems_and_rows members physical"]:
-        """The states after the reading from which they are so far `apart`."""
-        observed = apart.mean(-2, keepdims=True)
-        innovation = observed @ np.swapaxes(self.inverse, -1, -2) * self.share[..., None, :]
-        middle = innovation @ np.swapaxes(self.gain, -1, -2)
-        return states - middle - (apart - observed) @ np.swapaxes(self.shrinking, -1, -2)
-
-
-@dataclass(frozen=True)
-class Innovations:
-    """Differences between predicted and measured readings, each predicted from the readings of its window before it.
-
-    Attributes:
-        mean: Predicted mean minus the reading, in standard deviations of the sensors' noise.
-        corrections: How the states of all systems followed each reading.
-        whole: Windows in which no simulation failed, by system.
-        members: The ensembles' states after the last reading.
-        first: The first step whose errors count.
-    """
-
-    mean: Float[np.ndarray, "systems windows steps channels"]
-    corrections: Correction
-    whole: Bool[np.ndarray, "systems windows"]
-    members: Float[np.ndarray, "systems windows members state"]
-    first: int
-
-    @cached_property
-    def whitened(self) -> Float[np.ndarray, "systems windows steps channels"]:
-        """L⁻¹ (prediction - reading): of variance 1 if the model is right."""
-        return (self.corrections.inverse @ self.mean[..., None])[..., 0]
-
-    def surprise(self, loss: Loss) -> Float[np.ndarray, "systems windows"]:
-        """Mean of the loss of each window's whitened values; `FAILED_WINDOW` where a simulation failed."""
-        costs = window_costs(self.whitened.reshape(*self.whole.shape, -1), loss)
-        return np.where(self.whole, costs, FAILED_WINDOW)
-
-    def variances(self) -> Float[np.ndarray, "windows steps channels"]:
-        """Variance of each reading's prediction, in those of the sensors' noise, at least 1."""
-        return np.asarray((self.corrections.factor**2).sum(-1))
-
-    def counted(self, errors: Float[np.ndarray, "windows steps channels"]) -> Float[np.ndarray, "windows values"]:
-        """The errors that count, of all channels but those in which the first system's never differ from 0."""
-        kept = (self.whitened[0, :, self.first :] != 0.0).any((0, 1))
-        return errors[:, self.first :, kept].reshape(len(errors), -1)
-
-    def alike(self) -> float:
-        """The largest correlation of a channel's whitened errors with the next ones that is certain, outliers clipped.
-
-        It is that of the first system; 0 for right predictions, as these use every reading before them. What is certain
-        is what remains of a mean over windows less two standard errors.
-        """
-        errors = np.clip(self.whitened[0, self.whole[0], self.first :], -CLIP, CLIP)
-        if len(errors) < 2:
-            return 0.0
-        pairs, squares = (errors[:, 1:] * errors[:, :-1]).mean(1), (errors**2).mean((0, 1))
-        certain = pairs.mean(0) - 2.0 * pairs.std(0, ddof=1) / np.sqrt(len(pairs))
-        return float((certain / np.maximum(squares, _SMALLEST)).max(initial=0.0))
-
-    def noise_ratio(self) -> Float[np.ndarray, " channels"]:
-        """Mean square of each channel's prediction errors over their variance, outliers clipped; 1 if they are all 0.
-
-        It is that of the first system: Huber's (1964) second proposal for a scale, with a cut at three standard
-        deviations.
-        """
-        relative = (self.mean[0] ** 2 / self.variances())[self.whole[0], self.first :].reshape(-1, self.mean.shape[-1])
-        clipped = np.minimum(relative, CLIP**2).mean(0) / OF_CLIPPED if len(relative) else np.zeros(relative.shape[-1])
-        return np.where(clipped == 0.0, 1.0, clipped)
-
-
-def innovations(
-    simulator: Simulator,
-    readings: Readings,
-    points: Float[np.ndarray, "systems d"],
-    members: Float[np.ndarray, "windows members state"],
-    noise: Float[np.ndarray, " channels"],
-    *,
-    first: int = 0,
-    like: Innovations | None = None,
-) -> Innovations:
-    """Predict each reading after the first at every point, and move the members by it before the next one.
-
-    All systems follow readings as the first one's ensemble does, or as those of other innovations did, so that they
-    differ in their parameters alone, and few members may do where a larger ensemble is at hand. An error of the gain
-    hardly changes an estimate, as right predictions leave errors that are uncorrelated with all readings before.
-
-    The members are states as likely as the first reading; `noise` is that of the sensors in typical changes. Errors
-    count from the step `first` on. Spends systems · windows · members · steps control steps.
-    """
-    (windows, count, size), physical = members.shape, len(readings.spread)
-    system = simulator.bind(simulator.parameters.to_physical(np.clip(points, -1.0, 1.0)))
-    every = (len(points), windows * count, size)
-    states = system.unbiased(np.broadcast_to(members.reshape(every[1:]), every).copy())
-    shape, channels, corrections = (len(points), windows, readings.steps, len(noise)), len(noise), []
-    mean, whole = np.zeros(shape), np.ones(shape[:2], bool)
-    if like is not None:
-        whole &= like.whole[0]
-    for step in range(readings.steps):
-        actions = np.repeat(readings.actions[:, step], count, axis=0)
-        after = system.step(states, np.broadcast_to(actions, (*every[:2], actions.shape[-1])))
-        finite = np.isfinite(after).all(-1, keepdims=True)
-        after = np.where(finite, after, states)
-        seen = system.observe(after)[..., :channels].reshape(*shape[:2], count, channels)
-        apart = differences(simulator.task.attitudes, seen, readings.observed[:, step + 1, None])
-        apart = apart / (readings.scale * noise)
-        whole &= finite.reshape(*shape[:2], count).all(2) & np.isfinite(apart).all((2, 3))
-        grouped = np.where(whole[..., None, None], after.reshape(*shape[:2], count, size), 0.0)
-        apart = np.where(whole[..., None, None], apart, 0.0)
-        mean[:, :, step], moving = apart.mean(2), grouped[..., :physical]
-        if like is None:
-            correction = Correction.of(moving[0], apart[0])
-            corrections.append(correction)
-        else:
-            correction = Correction(*(each[:, step] for each in like.corrections))
-        grouped[..., :physical] = correction.follow(moving, apart)
-        states = np.where(whole[..., None, None], grouped, members).reshape(every)
-    every_step = (np.stack(each, axis=1) for each in zip(*corrections, strict=True))
-    followed = Correction(*every_step) if like is None else like.corrections
-    return Innovations(mean, followed, whole, states.reshape(*shape[:2], count, size), first)
 
 
 def next_noise(
@@ -213,26 +52,40 @@ def next_noise(
     return np.maximum(changed, np.maximum(rounding, LEAST_NOISE * changed.max()))
 
 
+class FilteredWindows(NamedTuple):
+    """Windows that a filter follows: the log, what it says of states, the model, readings, and the first rows."""
+
+    dataset: Dataset
+    logged: LoggedStates
+    simulator: Simulator
+    readings: Readings
+    rows: Int[np.ndarray, " windows"]
+
+    def of(self, kept: Int[np.ndarray, " some"]) -> "FilteredWindows":
+        """These windows alone."""
+        return self._replace(readings=self.readings.of(kept), rows=self.rows[kept])
+
+
 def with_noise(
-    dataset: Dataset,
-    logged: LoggedStates,
-    simulator: Simulator,
-    readings: Readings,
-    rows: Int[np.ndarray, " windows"],
+    windows: FilteredWindows,
     point: Float[np.ndarray, " d"],
     noise: Float[np.ndarray, " channels"],
     rounding: Float[np.ndarray, " channels"],
     count: int,
     rounds: int,
     random: np.random.Generator,
+    force: float = 0.0,
 ) -> tuple[Innovations, Float[np.ndarray, " channels"]]:
     """Innovations of so many members at one point, and the sensors' noise, estimated by them in several rounds.
 
-    It begins at a given one, in typical changes. Spends rounds · windows · members · steps control steps.
+    It begins at a given one, in typical changes; `force` is the size of random forces (`random_forces`). Spends
+    rounds · windows · members · steps control steps.
     """
+    dataset, logged, simulator, readings, rows = windows
     for _ in range(rounds):
         members = members_at(dataset, logged, simulator, rows, noise * readings.scale, count, random)
-        found = innovations(simulator, readings, point[None], members, noise, first=SPOILT)
+        forces = drawn(by_dof(simulator, force), (*members.shape[:2], readings.steps), random)
+        found = innovations(simulator, readings, point[None], members, noise, first=SPOILT, forces=forces)
         noise = next_noise(noise, found.noise_ratio(), rounding)
     return found, noise
 
@@ -379,8 +232,8 @@ def likely_states(
     begun, others = np.flatnonzero(follows), np.flatnonzero(~follows)
     if len(begun):
         earlier = Readings.at(dataset, logged, first[begun], before, readings.scale)
-        how = np.zeros_like(noise), DRAWN, NOISE_ROUNDS, random
-        found, noise = with_noise(dataset, logged, simulator, earlier, first[begun], point, noise, *how)
+        windows = FilteredWindows(dataset, logged, simulator, earlier, first[begun])
+        found, noise = with_noise(windows, point, noise, np.zeros_like(noise), DRAWN, NOISE_ROUNDS, random)
         whole = found.whole[0]
         tried[begun[whole], 1:, physical] = found.members[0, whole][..., physical]
     if len(others):

@@ -86,7 +86,7 @@ def assess(
     # starts they take much of the time.
     half = (bench.simulator.parameters.high - bench.simulator.parameters.low) / 2.0
     covariance = None if result.covariance is None else result.covariance / np.outer(half, half)
-    predict = partial(_predictions, bench, point, fits_starts, covariance)
+    predict = partial(_predictions, bench, point, fits_starts, covariance, np.array(result.random_forces))
     predictions = None if result.settled and not fits_starts else predict()
     holdout = measured(bench, result.mean, result.interval, fits_starts=fits_starts)
     if predictions is None:
@@ -153,12 +153,13 @@ def _predictions(
     point: Float[np.ndarray, " d"],
     fits_starts: bool,
     covariance: Float[np.ndarray, "d d"] | None,
+    forces: Float[np.ndarray, " dof"],
     noise: Float[np.ndarray, " observation"] | None = None,
 ) -> tuple[OpenLoop, ...]:
     """Predictions over longer times, if there is time for them."""
     if not bench.begins(LATER):
         return ()
-    return open_loop(bench, point, fits_starts=fits_starts, covariance=covariance, noise=noise)
+    return open_loop(bench, point, fits_starts=fits_starts, covariance=covariance, noise=noise, forces=forces)
 
 
 def _problem_of(result: CalibrationResult, training: Dataset | None, simulator: Simulator | None) -> CalibrationProblem:

@@ -11,13 +11,13 @@ from madoc.calibration.holdout import AgainstChance, Fitted
 from madoc.data import stride
 from madoc.identification.fitted_windows import LINEARISATIONS, fit_windows
 from madoc.identification.noise import residual_noise
+from madoc.identification.systematic import explained_at_end
 from madoc.simulation.attitudes import moved
 from madoc.verdict.bench import Bench
 from madoc.verdict.fitted_starts import FittedReplays
 from madoc.verdict.prediction import magnitudes
 from madoc.verdict.records import judged
 from madoc.verdict.statistics import best_of, better_than_chance, independent_groups, prediction_errors
-from madoc.verdict.systematic import explained_at_end
 
 
 def fitted(

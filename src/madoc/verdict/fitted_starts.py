@@ -74,10 +74,13 @@ class FittedReplays:
         return self.residuals_from(points, self.starts(points, near))
 
     def residuals_from(
-        self, points: Float[np.ndarray, "systems d"], states: Float[np.ndarray, "systems windows state"]
+        self,
+        points: Float[np.ndarray, "systems d"],
+        states: Float[np.ndarray, "systems windows state"],
+        forces: Float[np.ndarray, "systems windows steps dof"] | None = None,
     ) -> Float[np.ndarray, "systems windows readings channels"]:
-        """The residuals from given initial states."""
-        flat = self.readings.residuals(self.simulator, points, states)[:, 0]
+        """The residuals from given initial states, with `forces` from outside, in N or N·m."""
+        flat = self.readings.residuals(self.simulator, points, states, forces)[:, 0]
         return flat.reshape(*flat.shape[:2], *self.readings.observed.shape[1:])
 
     def starts(

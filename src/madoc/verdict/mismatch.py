@@ -8,11 +8,11 @@ from madoc.calibration.holdout import Area, Fitted, HoldOut, Predicted, Predicti
 from madoc.identification.candidate_terms import UNLISTED
 from madoc.identification.drifts import ONE_RUN, WITHIN_RUNS, is_change
 from madoc.identification.noise import WHITE
+from madoc.identification.systematic import EXPLAINED
 from madoc.identification.term_tests import MissingTerm, named
 from madoc.verdict.adequacy import about_timestep, as_likely, far_beyond_noise, missing_term, numerical
 from madoc.verdict.remedies import WARM_UP, is_of_spec, remedy, value_of
 from madoc.verdict.statistics import NEGLIGIBLE, beyond_noise
-from madoc.verdict.systematic import EXPLAINED
 
 PERSISTENT = 0.1
 """Correlation in [-1, 1] of residuals with those a few rows later, above which a force is missing that lasts."""

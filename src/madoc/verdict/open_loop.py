@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from madoc import simulation
 from madoc.calibration.holdout import OpenLoop
 from madoc.data import stride
+from madoc.identification import random_forces
 from madoc.identification.noise import residual_noise
 from madoc.identification.replay import window_residuals
 from madoc.identification.states import logged_states
@@ -50,6 +51,7 @@ def open_loop(
     fits_starts: bool = False,
     covariance: Float[np.ndarray, "d d"] | None = None,
     noise: Float[np.ndarray, " observation"] | None = None,
+    forces: Float[np.ndarray, " dof"] | None = None,
 ) -> tuple[OpenLoop, ...]:
     """Errors of open-loop predictions of the hold-out at an estimate in [-1, 1], one record for each length of time.
 
@@ -57,8 +59,9 @@ def open_loop(
     There are none where the log tells no states to begin at, and none of a length that no held-out stretch has.
     From fitted states those of shorter times are the beginnings of one prediction where runs are long enough, so that
     starts are fitted once. With the estimate's `covariance`, in [-1, 1], it is also said how many times as large errors
-    are as those of a hold-out that the model itself would make: from fitted states an imitated one (`_imitated`), and
-    from logged states what the sensors' `noise`, in typical changes of a stride, and random forces make.
+    are as those of a hold-out that the model itself would make: from fitted states an imitated one (`_imitated`), on
+    which random `forces` of these standard deviations, in N or N·m, have acted; from logged states what the sensors'
+    `noise`, in typical changes of a stride, and random forces make, as these are read off the log there.
     """
     if bench.states.kind == "unknown" or bench.held_out.disturbance.shuffled != "none":
         return ()
@@ -67,7 +70,7 @@ def open_loop(
     before = FITTED * stride(bench.problem.dataset) if fits_starts else 0
     predicted = partial(_from_logged, bench, given, point, covariance, noise)
     if fits_starts:
-        predicted = partial(_from_fitted, bench, given, point, covariance)
+        predicted = partial(_from_fitted, bench, given, point, covariance, np.zeros(0) if forces is None else forces)
     whole = int(np.median(held.episode_ends - held.episode_starts)) - before
     shorter = [steps for steps in sorted({max(1, round(seconds / step)) for seconds in SECONDS}) if steps < whole]
     begin = (held.episode_ends - held.episode_starts - before - max(shorter, default=0)).clip(min=0).sum()
@@ -198,6 +201,7 @@ def _from_fitted(
     given: Simulator,
     point: Float[np.ndarray, " d"],
     covariance: Float[np.ndarray, "d d"] | None,
+    forces: Float[np.ndarray, " dof"],
     steps: int,
 ) -> tuple[Float[np.ndarray, "models windows steps channels"], Int[np.ndarray, " windows"]] | None:
     """The same from starts that are fitted under each model to the strides before, and of the imitated hold-out."""
@@ -215,7 +219,7 @@ def _from_fitted(
         states = replays.starts(points)
         parts = [replays.residuals_from(points, states)]
         if simulator is bench.simulator and covariance is not None:
-            parts.append(_imitated(bench, replays, point, covariance, states[-1], parts[0][-1]))
+            parts.append(_imitated(bench, replays, point, covariance, forces, states[-1], parts[0][-1]))
         of_models += [part[:, :, replays.fitted + 1 :] for part in parts]
         rows = replays.rows
     return np.concatenate(of_models), rows
@@ -226,18 +230,21 @@ def _imitated(
     replays: FittedReplays,
     point: Float[np.ndarray, " d"],
     covariance: Float[np.ndarray, "d d"],
+    forces: Float[np.ndarray, " dof"],
     states: Float[np.ndarray, "windows state"],
     residuals: Float[np.ndarray, "windows readings channels"],
 ) -> Float[np.ndarray, "1 windows readings channels"]:
     """Residuals at the estimate of a hold-out as the model itself would make it (a posterior predictive check).
 
-    Its windows begin where the log's do, at `states`. Its parameters are a few for all windows (`_drawn`), and its
-    sensors have the noise that the estimate's `residuals` of fitted readings have. What is missing in the model then
-    shows in errors of the log that are larger than these (Gelman, Meng and Stern 1996).
+    Its windows begin where the log's do, at `states`. Its parameters are a few for all windows (`_drawn`), random
+    `forces` act on it, and its sensors have the noise that the estimate's `residuals` of fitted readings have. What is
+    missing in the model then shows in errors of the log that are larger than these (Gelman, Meng and Stern 1996).
     """
     random, readings, windows = np.random.default_rng(0), replays.readings, np.arange(len(replays.readings))
     drawn = _drawn(point, covariance)
-    made = replays.residuals_from(drawn, np.repeat(states[None], IMITATED, axis=0))[windows % IMITATED, windows]
+    pushes = random_forces.drawn(forces, (IMITATED, len(windows), readings.steps), np.random.default_rng(1))
+    begun = np.repeat(states[None], IMITATED, axis=0)
+    made = replays.residuals_from(drawn, begun, pushes)[windows % IMITATED, windows]
     noise = residual_noise(residuals[:, : replays.fitted + 1], made.shape[-1])
     made = np.where(np.isfinite(made), made, 0.0) + noise * random.standard_normal(made.shape)
     observed = moved(bench.simulator.task.attitudes, readings.observed, made * readings.scale)

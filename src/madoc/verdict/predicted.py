@@ -12,6 +12,7 @@ from madoc.identification import noise as sensors
 from madoc.identification.gauss_newton import DAMPING, descend
 from madoc.identification.losses import NORMAL_MAD
 from madoc.identification.states import logged_states
+from madoc.identification.systematic import EXPLAINED, autocorrelation, explained, explained_at_end, persistence
 from madoc.identification.windows import consecutive_rows, evenly
 from madoc.simulation.attitudes import differences
 from madoc.verdict.bench import Bench
@@ -26,7 +27,6 @@ from madoc.verdict.statistics import (
     prediction_errors,
     relative_to_first,
 )
-from madoc.verdict.systematic import EXPLAINED, autocorrelation, explained, explained_at_end, persistence
 
 WHOLE_STEPS = 3
 """Number of Gauss-Newton steps on whole windows, at least 1; they begin at the minimum of single steps."""

@@ -39,6 +39,7 @@ from madoc.errors import MadocError
 from madoc.identification.information import identifiability, quantile, sandwich
 from madoc.identification.losses import Loss
 from madoc.identification.noise import NOISY, alternation
+from madoc.identification.random_forces import by_dof
 from madoc.simulation.base import SIMULATED
 from madoc.types import Count, Epoch, NotNegative, check_hyperparameters, named_key
 
@@ -204,12 +205,10 @@ class LeastSquares:
         errors = quantile(found.windows, len(space))
         width = half * errors * np.sqrt(np.diag(uncertainty.covariance))
         interval = np.clip(np.stack([mean - width, mean + width], axis=-1), space.low[:, None], space.high[:, None])
-        searches = (each for each in (state.known, state.filtered, *state.unknown) if each is not None)
         return Estimate(
             mean=mean,
             std=np.sqrt(np.diag(covariance)),
-            groups=(tuple(range(len(space))),),
-            failures=sum(search.failures for search in searches),
+            failures=sum(each.failures for each in (state.known, state.filtered, *state.unknown) if each is not None),
             notes=self._notes(problem, state),
             warnings=(
                 *identifiability(uncertainty, space.names),
@@ -225,6 +224,7 @@ class LeastSquares:
             settled=found.settled,
             unlike_noise=found.unlike_noise,
             effective=progress == "better",
+            random_forces=by_dof(problem.simulator, found.force),
         )
 
     def whole_run(self, problem: CalibrationProblem, state: LeastSquaresState, *, refining_epochs: int) -> int:
@@ -385,7 +385,7 @@ class LeastSquares:
     def _about_residuals(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[str, ...]:
         """Sentences on what estimated initial states leave, unless the user asked for them."""
         if state.by_filter is not None:
-            return sentences.about_surprises(state.by_filter)
+            return sentences.about_surprises(problem, state.by_filter)
         if not state.estimates_starts or self.initial_states is not None:
             return ()
         best = state.unknown[state.best]

@@ -7,33 +7,40 @@ anything known before them (prediction error method, Ljung 1999, chapter 7).
 Errors and derivatives are those of two ensembles (`instruments`).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import jax
 import numpy as np
-from jaxtyping import Float, Int, PRNGKeyArray
+from jaxtyping import Float, PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem
+from madoc.calibration.least_squares.filter_state import LIKE_CHANCE, NEAR, FilterState
 from madoc.calibration.least_squares.instruments import (
     FEW,
     Side,
     agreed,
     axes_of,
-    beyond_chance,
     moved_by,
     over_windows,
     products_of,
     shares_of,
     surprises,
 )
-from madoc.calibration.least_squares.plan import FEWEST, Found
-from madoc.calibration.least_squares.statistics import LONG_TAILS, touched
+from madoc.calibration.least_squares.plan import FEWEST
+from madoc.calibration.least_squares.remainder import (
+    LARGE,
+    LARGE_ROUNDS,
+    size_steps,
+    with_random_forces,
+    with_what_is_left,
+)
+from madoc.calibration.least_squares.statistics import touched
 from madoc.data import stride
-from madoc.identification.ensembles import SPOILT, innovations, next_noise, with_noise
-from madoc.identification.gauss_newton import FIRST_DAMPING, TRIALS, damped_step
+from madoc.identification.ensembles import SPOILT, FilteredWindows, next_noise, with_noise
+from madoc.identification.gauss_newton import TRIALS, damped_step
 from madoc.identification.information import sandwich
+from madoc.identification.innovations import innovations
 from madoc.identification.losses import Loss
-from madoc.identification.noise import WHITE
 from madoc.identification.replay import Readings
 from madoc.identification.settling import FAILED_WINDOW
 from madoc.identification.windows import disjoint_windows, interleaved, rows_that_fit
@@ -50,11 +57,6 @@ EARLY_EPOCHS = 8
 """Largest number of the first epochs, which end once the noise is known and steps are below `NEAR`."""
 WIDTH = 0.1
 """Width of a difference in [-1, 1] to either side at first; later it is by what is known of parameters, `axes_of`."""
-MEMBERS = 32
-"""Number of states in an ensemble; the last epochs, with half as many, tell what a finite one errs."""
-LARGE, LARGE_ROUNDS, LARGER = 64, 2, 4
-"""Number of states that tell at the end whether what is left is noise, as few leave errors that are alike, and how
-often noise is estimated by them. Windows that such an ensemble loses are given to one so many times as large."""
 LONGEST = 0.5
 """Largest change of a parameter in an epoch, in [-1, 1]."""
 DAMPED = 10.0
@@ -63,11 +65,6 @@ WORSE = 2.0
 """Mean change of the windows' surprise in its standard errors; above it a step certainly makes it worse."""
 DAMPING = (1e-4, 1e2)
 """Smallest and largest damping of a step, relative to the columns' squared lengths."""
-NEAR, LIKE_CHANCE = 2.5, 1.0
-"""Steps in what chance usually makes (`moved_by`), below which the first epochs end and later ones count together, and
-below which the search ends."""
-TOGETHER = 3
-"""Least number of epochs that count together in the end."""
 USUAL_EPOCHS = (2, 8)
 """Numbers of first and later epochs that most searches take, for the time that is told to be left; ensembles of half
 the size take about half an epoch."""
@@ -86,120 +83,6 @@ FIRST_SEEN, MOST_SEEN = 64, 512
 """Number of windows of which it is asked first whether bodies touch in any, and largest number of which it is asked."""
 MOST_TOLD = 0.9
 """Share in (0, 1) that counts of what a window tells where no other one tells of a direction."""
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class FilterState:
-    """The state of the search.
-
-    Attributes:
-        point: The parameters, in [-1, 1].
-        horizon: Length of a window in control steps.
-        rows: First rows of the windows, in random order, but that as many touch in every block of them.
-        size: Number of windows of an epoch, a block of them.
-        spread: Differences along each axis of the parameters' covariance, in [-1, 1], in columns.
-        noise: Noise of each channel in its typical changes.
-        seed: Seed of the ensembles' random numbers.
-        gradients: Each window's gradient of the cost, 0 until an epoch has had it; the mean where several have.
-        products: Of both ensembles' derivatives in each window, the curvature of the cost, likewise.
-        squares: Of each ensemble's own, which chance makes larger.
-        meat: Scatter of the gradients before the last step, which counts as an error.
-        apart: What gradients of half as many states differ from these, sum of the windows compared so far.
-        chance: Scatter of those differences.
-        compared: Number of these windows.
-        moved: The last step, by `moved_by`.
-        damping: λ of the next step.
-        cost: Mean loss of a whitened prediction error before it, in squared standard deviations.
-        alike: The largest correlation that a channel's whitened error certainly has with that of the next reading, as
-            noise has none; 0 until the end.
-        wide: 0 in the first epochs, then 1 and the number of epochs since.
-        quiet: 1 once noise, its mean over epochs that count together, has not changed much from one epoch to the next.
-        halved: Number of blocks of windows compared with what half as many states tell.
-        together: Number of epochs near the end that the last step was by, 0 before these.
-        epochs: Number of epochs.
-        failures: Number of windows whose simulation failed.
-    """
-
-    point: Float[np.ndarray, " d"]
-    horizon: int
-    rows: Int[np.ndarray, " windows"]
-    size: int
-    spread: Float[np.ndarray, "d d"]
-    noise: Float[np.ndarray, " channels"]
-    seed: int
-    gradients: Float[np.ndarray, "windows d"]
-    products: Float[np.ndarray, "windows d d"]
-    squares: Float[np.ndarray, "windows d d"]
-    meat: Float[np.ndarray, "d d"]
-    apart: Float[np.ndarray, " d"]
-    chance: Float[np.ndarray, "d d"]
-    compared: int = 0
-    moved: float = 0.0
-    damping: float = FIRST_DAMPING
-    cost: float = 0.0
-    alike: float = 0.0
-    wide: int = 0
-    quiet: int = 0
-    halved: int = 0
-    together: int = 0
-    epochs: int = 0
-    failures: int = 0
-
-    @property
-    def blocks(self) -> int:
-        """Number of blocks of windows, of which every epoch has one."""
-        return max(1, len(self.rows) // self.size)
-
-    @property
-    def block(self) -> slice:
-        """The windows of the next epoch."""
-        if not self.wide:
-            return slice(0, self.size // 2)
-        number = (self.halved if self.at_rest else self.together if self.near else 0) % self.blocks
-        return slice(number * self.size, (number + 1) * self.size if number + 1 < self.blocks else None)
-
-    @property
-    def members(self) -> int:
-        """Number of states in an ensemble of the next epoch."""
-        return MEMBERS // 2 if self.at_rest else MEMBERS
-
-    @property
-    def explained(self) -> int:
-        """Number of windows that count."""
-        return int(self.squares.any((1, 2)).sum())
-
-    @property
-    def at_rest(self) -> bool:
-        """Whether the last step, by several epochs in known noise, may be chance."""
-        enough = self.explained >= FEWEST + len(self.point)
-        return enough and self.together >= TOGETHER and bool(self.quiet) and self.moved < LIKE_CHANCE
-
-    @property
-    def to_compare(self) -> int:
-        """Number of blocks still to be compared with what half as many states tell, once at rest."""
-        return min(self.together, self.blocks) - self.halved
-
-    @property
-    def settled(self) -> bool:
-        """Whether the search is at its end, and the error of finite ensembles is known."""
-        return self.at_rest and self.to_compare <= 0
-
-    @property
-    def near(self) -> bool:
-        """Whether the next step is to be by the next epoch and those before it that count together."""
-        return self.wide > 1 and bool(self.quiet) and self.moved < NEAR
-
-    @property
-    def found(self) -> Found:
-        """The point, with its uncertainty by the epochs that count together."""
-        products, squares = self.products.sum(0), self.squares.sum(0)
-        told = np.diag(squares) > 0.0
-        bread = agreed(products, squares) * np.outer(told, told)
-        error = beyond_chance(self.apart, self.chance, self.compared)
-        uncertainty = sandwich(bread, self.meat + np.outer(error, error))
-        unlike_noise = self.settled and (self.cost > LONG_TAILS or self.alike > WHITE)
-        return Found(self.point, uncertainty, self.explained, self.settled, unlike_noise)
 
 
 def horizon_of(problem: CalibrationProblem) -> int:
@@ -254,6 +137,8 @@ def of_contacts(
 
 def epoch_steps(problem: CalibrationProblem, state: FilterState) -> int:
     """Control steps of the next epoch, but for windows lost in the last one; at rest no step is tried."""
+    if state.forces == 1:
+        return size_steps(min(state.size, len(state.rows)), state.horizon)
     members, tried = state.members, 0 if state.at_rest else 1 + len(TRIALS)
     few = (2 * 2 * len(problem.simulator.parameters) + tried) * FEW
     alone = 0 if state.wide else NOISE_ROUNDS * members
@@ -280,12 +165,15 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
     readings = Readings.at(problem.dataset, problem.states, rows, state.horizon, problem.typical_change)
     rounding = (problem.rounding / problem.typical_change)[: len(state.noise)]
     random = [np.random.default_rng([state.seed, state.epochs, number]) for number in range(3)]
-    log = problem.dataset, problem.states, problem.simulator, readings, rows
+    windows = FilteredWindows(problem.dataset, problem.states, problem.simulator, readings, rows)
+    some = windows.of(np.arange(min(state.size, len(rows))))
+    if state.forces == 1:
+        return with_random_forces(some, state, rounding), Epoch({"moved": state.moved})
     if not state.wide:
-        how = rounding, count, NOISE_ROUNDS, random[2]
-        state = replace(state, noise=with_noise(*log, state.point, state.noise, *how)[1])
+        how = rounding, count, NOISE_ROUNDS, random[2], state.force
+        state = replace(state, noise=with_noise(windows, state.point, state.noise, *how)[1])
     given = problem, readings, rows, state.point, state.spread, state.noise, count
-    sides = [Side.of(*given, each) for each in random[:2]]
+    sides = [Side.of(*given, each, state.force) for each in random[:2]]
     whole = np.logical_and(*(each.found.whole[0] & each.ends.whole.all(0) for each in sides))
     fresh = products_of(sides[0], sides[1], whole, loss)
     if state.at_rest:
@@ -303,17 +191,7 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
             failures=failures,
         )
         if following.settled:
-            some = np.arange(min(state.size, len(rows)))
-            fewer = *log[:3], readings.of(some), rows[some]
-            _, known = with_noise(*fewer, state.point, state.noise, rounding, LARGE, LARGE_ROUNDS - 1, random[2])
-            found, noise = with_noise(*fewer, state.point, known, rounding, LARGE, 1, random[2])
-            costs = surprises(found, loss)
-            if (lost := np.flatnonzero(costs > LONG_TAILS)).size:
-                # An ensemble may lose what it follows by chance. What the model lacks surprises a larger one as well.
-                again = *log[:3], readings.of(lost), rows[lost]
-                larger, _ = with_noise(*again, state.point, known, rounding, LARGER * LARGE, 1, random[2])
-                costs[lost] = np.minimum(costs[lost], surprises(larger, loss))
-            following = replace(following, noise=noise, cost=over_windows(costs), alike=found.alike())
+            following = with_what_is_left(some, following, rounding, loss, random[2])
         return following, Epoch({"moved": state.moved})
     together = state.together + 1 if state.near else 0
     gradients, products, squares = (
@@ -384,7 +262,8 @@ def _taken(
     damping = state.damping * np.array(TRIALS) * [not state.near, True, True]
     tried = np.clip([damped_step(factor, target, state.point, each) for each in damping], -LONGEST, LONGEST)
     points = np.concatenate([state.point[None], state.point + tried])
-    surprise = innovations(problem.simulator, readings, points, side.few, state.noise, like=side.found).surprise(loss)
+    given = problem.simulator, readings, points, side.few, state.noise
+    surprise = innovations(*given, like=side.found, forces=side.forces).surprise(loss)
     change = surprise[1:] - surprise[0]
     fails = ((surprise[1:] == FAILED_WINDOW) & (surprise[0] < FAILED_WINDOW)).any(1)
     best = int(np.argmin(np.where(fails, np.inf, change.mean(1))))

@@ -19,14 +19,16 @@ from jaxtyping import Bool, Float, Int
 from scipy.stats import norm
 
 from madoc.calibration.base import CalibrationProblem
-from madoc.identification.ensembles import SPOILT, Innovations, few_of, innovations, members_at
+from madoc.identification.ensembles import SPOILT, few_of, members_at
+from madoc.identification.innovations import Innovations, innovations
 from madoc.identification.linearisation import LEAST_CURVATURE
 from madoc.identification.losses import TUNING, Loss, curvature_share, loss_slope
+from madoc.identification.random_forces import by_dof, drawn
 from madoc.identification.replay import Readings
 from madoc.identification.settling import window_costs
 
 FEW = 2
-"""Number of states at the ends of differences and after steps that are tried; time is better spent on more windows."""
+"""Even number of states at the ends of differences and after steps that are tried; time is better spent on windows."""
 WIDTHS = (0.005, 0.4)
 """Smallest and largest width of a difference in [-1, 1] to either side."""
 WIDER, WIDE = 3.0, 0.02
@@ -50,6 +52,7 @@ class Side:
         ends: Those of few states at the ends of differences to either side of it.
         apart: The parameters' change in each difference, in rows.
         aside: How far the mean of its ends is from the point.
+        forces: Random forces on the few states, in N or N·m; None where there are none.
     """
 
     few: Float[np.ndarray, "windows few state"]
@@ -57,6 +60,7 @@ class Side:
     ends: Innovations
     apart: Float[np.ndarray, "d d"]
     aside: Float[np.ndarray, " d"]
+    forces: Float[np.ndarray, "windows few steps dof"] | None
 
     @classmethod
     def of(
@@ -69,18 +73,25 @@ class Side:
         noise: Float[np.ndarray, " channels"],
         count: int,
         random: np.random.Generator,
+        force: float = 0.0,
     ) -> "Side":
         """An ensemble of so many states, and differences to either side of the point, not out of a range.
 
-        `spread` are the differences in columns, in [-1, 1], and `noise` is in typical changes.
+        `spread` are the differences in columns, in [-1, 1], and `noise` is in typical changes. Random forces of size
+        `force` (`random_forces`) act on all states, on the few in pairs of opposite ones, so that their mean is 0.
         """
         states, simulator = problem.states, problem.simulator
         members = members_at(problem.dataset, states, simulator, rows, noise * readings.scale, count, random)
         few = few_of(members, FEW, states.physical_size)
         above, below = (np.clip(point + sign * spread.T, -1.0, 1.0) for sign in (1, -1))
-        found = innovations(simulator, readings, point[None], members, noise, first=SPOILT)
-        ends = innovations(simulator, readings, np.concatenate([above, below]), few, noise, like=found)
-        return cls(few, found, ends, above - below, (above + below).mean(0) / 2.0 - point)
+        deviations, windows = by_dof(simulator, force), len(rows)
+        forces = drawn(deviations, (windows, count, readings.steps), random)
+        half = drawn(deviations, (windows, FEW // 2, readings.steps), random)
+        on_few = None if half is None else np.concatenate([half, -half], axis=1)
+        found = innovations(simulator, readings, point[None], members, noise, first=SPOILT, forces=forces)
+        both = np.concatenate([above, below])
+        ends = innovations(simulator, readings, both, few, noise, like=found, forces=on_few)
+        return cls(few, found, ends, above - below, (above + below).mean(0) / 2.0 - point, on_few)
 
     def errors(self) -> Float[np.ndarray, "windows values"]:
         """Whitened prediction errors at the point: the mean over the differences' ends, led back from theirs to it."""

@@ -14,9 +14,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from madoc.calibration.base import CalibrationProblem
-from madoc.calibration.least_squares.filtering import FilterState
+from madoc.calibration.least_squares.filter_state import FilterState
 from madoc.calibration.least_squares.plan import FEWEST
 from madoc.calibration.least_squares.predicting import Prediction
+from madoc.calibration.least_squares.remainder import may_be_pushed
 from madoc.calibration.least_squares.search import SearchState
 from madoc.calibration.least_squares.statistics import touched
 from madoc.data import Dataset
@@ -207,7 +208,7 @@ def begun(state: LeastSquaresState, known: SearchState) -> LeastSquaresState:
 
 
 def after_filter(problem: CalibrationProblem, state: LeastSquaresState, horizon: int) -> LeastSquaresState:
-    """The state after an epoch of the filter: at its end, or with fitted starts where it left what is unlike noise.
+    """The state after an epoch of the filter: at its end, or going on where it left what is unlike noise.
 
     What an ensemble leaves of data without noise is like what it leaves of the next reading. Where fitted starts of a
     few windows of this horizon leave less, the search goes on with them to the exact values.
@@ -217,14 +218,14 @@ def after_filter(problem: CalibrationProblem, state: LeastSquaresState, horizon:
     if not filtered.settled:
         return state
     if not state.unknown or not filtered.found.unlike_noise:
-        return replace(state, finished=1)
+        return back_to_filter(state)
     first, point, log = state.unknown[0], filtered.point, (problem.dataset, problem.states, problem.simulator)
     readings = Readings.at(problem.dataset, problem.states, first.rows, horizon, problem.typical_change)
     (likely,) = likely_states(*log, readings, first.rows, point[None], first.states[0])
     tried = settled(problem.simulator, readings, point, likely, (0.0, *RESETTLING), 0)
     whole = (tried.costs < FAILED_WINDOW).sum() >= FEWEST + len(point)
     if not whole or (tried.deviation > LESS * filtered.noise).any():
-        return replace(state, finished=1)
+        return back_to_filter(state)
     found = settled_to_noise(problem.simulator, readings, point, likely)
     first = replace(first, point=point[None].copy(), states=found.states[None], refining=1)
     return replace(state, unknown=(first,), stage="estimated")
@@ -239,8 +240,15 @@ def leaves_much_less(search: SearchState, filtered: FilterState) -> bool:
 
 
 def back_to_filter(state: LeastSquaresState) -> LeastSquaresState:
-    """The end of all with the filter's estimate: the data has noise, or the model lacks something."""
-    return replace(state, stage="filtering", finished=1)
+    """The end of all with the filter's estimate, or a step by which it looks for random forces first.
+
+    The data has noise then, or the model lacks something.
+    """
+    state = replace(state, stage="filtering")
+    assert state.filtered is not None
+    if may_be_pushed(state.filtered):
+        return replace(state, filtered=replace(state.filtered, forces=1))
+    return replace(state, finished=1)
 
 
 def failed(state: LeastSquaresState) -> LeastSquaresState:

@@ -69,6 +69,7 @@ class Found:
         windows: Number of independent windows that tell it.
         settled: Whether the search has come to its end.
         unlike_noise: Whether residuals have longer tails than noise has, or each is like the next.
+        force: Size of random forces in N/√kg (`identification.random_forces`); 0 where none were found.
     """
 
     point: Float[np.ndarray, " d"]
@@ -76,6 +77,7 @@ class Found:
     windows: int
     settled: bool
     unlike_noise: bool
+    force: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -4,11 +4,13 @@ import numpy as np
 from jaxtyping import Float
 
 from madoc.calibration.base import CalibrationProblem
-from madoc.calibration.least_squares.filtering import FilterState
+from madoc.calibration.least_squares.filter_state import FilterState
 from madoc.calibration.least_squares.search import SearchState
 from madoc.calibration.least_squares.statistics import EXACT, LONG_TAILS
 from madoc.data import stride
 from madoc.identification.noise import WHITE
+from madoc.identification.random_forces import by_dof
+from madoc.identification.systematic import EXPLAINED
 
 MOST_LEFT_OUT = 0.05
 """Share in [0, 1] of windows that no initial state explains; without contacts, noise alone leaves out fewer."""
@@ -18,6 +20,15 @@ TAILS = "residuals have longer tails than noise has: the intervals are too narro
 ALIKE = (
     "what the model leaves of a reading is like what it leaves of the next (a correlation of at least {:.2f}), as "
     "noise is not: the intervals are too narrow, by how much is not known"
+)
+EXPLAINED_BY = (
+    "state and action explain {:.0%} of what the model leaves of a signal, or of the forces that make it, as they do "
+    "not of noise: the model lacks something, and the intervals are too narrow, by how much is not known"
+)
+PUSHED = (
+    "random forces that the model does not have act on the machine: about {:.2g} to {:.2g} N or N·m on a degree of "
+    "freedom, another one in each control step (`random_forces` in result.json); the intervals allow for them, and a "
+    "policy should be trained with them"
 )
 NOT_SETTLED = (
     "the search had not settled when it ended, and intervals do not count what is missing; take a larger budget"
@@ -64,10 +75,13 @@ def about_filtered_states(problem: CalibrationProblem, search: FilterState, *, a
     return f"{sentence}; {_how_large(problem, search.noise)}, and the intervals allow for it"
 
 
-def about_surprises(search: FilterState) -> tuple[str, ...]:
-    """Sentences on what prediction errors of an ensemble filter have that noise has not."""
+def about_surprises(problem: CalibrationProblem, search: FilterState) -> tuple[str, ...]:
+    """Sentences on what prediction errors of an ensemble filter have that noise has not, and on random forces."""
     unlike = [TAILS] * (search.cost > LONG_TAILS) + [ALIKE.format(search.alike)] * (search.alike > WHITE)
-    return tuple(unlike) if search.found.unlike_noise else ()
+    unlike += [EXPLAINED_BY.format(search.known)] * (search.known > EXPLAINED)
+    forces = by_dof(problem.simulator, search.force)
+    pushed = (PUSHED.format(forces.min(), forces.max()),) if len(forces) and search.known <= EXPLAINED else ()
+    return (*(unlike if search.found.unlike_noise else ()), *pushed)
 
 
 def _why_states_are_not_known(problem: CalibrationProblem) -> str:

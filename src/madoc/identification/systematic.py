@@ -1,6 +1,6 @@
 """Whether residuals are noise, or a function of the robot's state and action."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from itertools import islice
 from typing import Any
 
@@ -63,20 +63,37 @@ def explained(
     Returns:
         The share of the better regression, at least 0 (a constant residual counts as explained), and its predictions.
     """
-    total = float((residuals**2).sum())
-    best, explanation = 0.0, np.zeros_like(residuals)
-    wanted = residuals.ravel() if residuals.shape[1] == 1 else residuals
-    folds = list(KFold(FOLDS).split(inputs)) if folds is None and len(inputs) >= _FEWEST else folds or []
-    enough = folds and min(len(learnt) for learnt, _ in folds) >= _FEWEST
-    if not enough or np.sqrt((residuals**2).mean(0)).max() <= _ROUNDING:
-        return best, explanation
-    for make in EXPLAINERS.values():
-        with threadpool_limits(1):  # the same bits on any number of cores, and no threads that wait for each other
-            guess = cross_val_predict(make(), inputs, wanted, cv=folds).reshape(residuals.shape)
+    total, best, explanation = float((residuals**2).sum()), 0.0, np.zeros_like(residuals)
+    for guess in _guesses(inputs, residuals, folds):
         share = 1.0 - float(((residuals - guess) ** 2).sum()) / total
         if share > best:
             best, explanation = share, guess
     return best, explanation
+
+
+def explained_each(
+    inputs: Float[np.ndarray, "rows inputs"], residuals: Float[np.ndarray, "rows observation"]
+) -> Float[np.ndarray, " observation"]:
+    """The same share of every channel by itself, by the regression that explains it best."""
+    shares = np.zeros(residuals.shape[1])
+    for guess in _guesses(inputs, residuals, None):
+        left, total = ((residuals - guess) ** 2).sum(0), (residuals**2).sum(0)
+        shares = np.maximum(shares, 1.0 - left / np.maximum(total, np.finfo(float).tiny))
+    return shares
+
+
+def _guesses(
+    inputs: Float[np.ndarray, "rows inputs"], residuals: Float[np.ndarray, "rows observation"], folds: Folds | None
+) -> Iterator[Float[np.ndarray, "rows observation"]]:
+    """What each regression predicts of residuals; nothing where there are too few, or all are rounding."""
+    folds = list(KFold(FOLDS).split(inputs)) if folds is None and len(inputs) >= _FEWEST else folds or []
+    enough = folds and min(len(learnt) for learnt, _ in folds) >= _FEWEST
+    if not enough or np.sqrt((residuals**2).mean(0)).max() <= _ROUNDING:
+        return
+    wanted = residuals.ravel() if residuals.shape[1] == 1 else residuals
+    for make in EXPLAINERS.values():
+        with threadpool_limits(1):  # the same bits on any number of cores, and no threads that wait for each other
+            yield cross_val_predict(make(), inputs, wanted, cv=folds).reshape(residuals.shape)
 
 
 def explained_at_end(

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from madoc.verdict.systematic import (
+from madoc.identification.systematic import (
     autocorrelation,
     disjoint_folds,
     explained,
