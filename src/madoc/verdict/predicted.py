@@ -33,7 +33,7 @@ WHOLE_STEPS = 3
 MOST_ROWS = 4000
 """Largest number of held-out rows whose residuals are compared with those of later rows."""
 TOUCHING = 0.1
-"""Share in [0, 1] of held-out rows in which bodies touch; with more, noise of a state is not small for its motion."""
+"""Share in [0, 1] of held-out windows in which bodies touch; with more, noise of a state is not small for motion."""
 ROUNDED = 3.0
 """Standard deviations of the readings' rounding; residuals of single steps that are not larger tell of no noise."""
 
@@ -73,7 +73,7 @@ def noise_hides_gain(bench: Bench) -> bool:
 
 
 def noisy_contacts(bench: Bench, point: Float[np.ndarray, " d"]) -> bool:
-    """Whether bodies touch in the hold-out, and logged states are noisy.
+    """Whether bodies touch in windows of the hold-out, and logged states are noisy.
 
     Replays from these then err by what contacts make of noise. It shows in residuals of single steps, larger than
     readings' rounding makes them, that alternate; those of an estimate with far larger errors do not. A delay that the
@@ -81,13 +81,15 @@ def noisy_contacts(bench: Bench, point: Float[np.ndarray, " d"]) -> bool:
     count.
     """
     states, rows = logged_states(bench.held_out, bench.simulator.task)
-    seen = states[evenly(np.arange(len(states)), MOST_ROWS)]
+    places = evenly(np.arange(len(states)), MOST_ROWS)
+    seen, of_seen = states[places], rows[places]
     follows = consecutive_rows(bench.held_out, rows)
     first = rows[evenly(follows[np.isin(follows - 1, follows)], MOST_ROWS)]
     if not len(first):
         return False
     contacts = bench.simulator.contacts(seen, bench.simulator.parameters.to_physical(point.clip(-1.0, 1.0)))
-    if float((contacts > 0).mean()) < TOUCHING:
+    windows = of_seen // bench.replays.windows.steps
+    if len(np.unique(windows[contacts > 0])) < TOUCHING * len(np.unique(windows)):
         return False
     pairs = np.stack([_residuals(bench, point, each) for each in (first, first + 1)])
     whole, actions = np.isfinite(pairs).all((0, 2)), np.asarray(bench.held_out.transitions.action)

@@ -14,7 +14,6 @@ from madoc.identification.innovations import Innovations
 from madoc.identification.losses import Loss
 from madoc.identification.noise import WHITE
 from madoc.identification.random_forces import largest
-from madoc.identification.systematic import EXPLAINED
 
 LARGE, LARGE_ROUNDS, LARGER = 64, 2, 4
 """Number of states that tell at the end whether what is left is noise, as few leave errors that are alike, and how
@@ -53,8 +52,8 @@ def with_what_is_left(
 
 
 def may_be_pushed(state: FilterState) -> bool:
-    """Whether errors are as those of a filter that does not know what acts on the machine, and no forces were tried."""
-    return state.settled and state.forces == 0 and (state.alike > LASTING or state.known > EXPLAINED)
+    """Whether errors at the end may be those of a filter that does not know random forces, and none were tried."""
+    return state.settled and state.forces == 0 and (state.found.unlike_noise or state.alike > LASTING)
 
 
 def size_steps(windows: int, horizon: int) -> int:
