@@ -21,6 +21,7 @@ from madoc.verdict.adequacy import (
     actions_in_time,
     as_likely,
     coarse_step,
+    felt,
     in_full,
     likeliest,
     missing_term,
@@ -54,6 +55,16 @@ def test_each_end_moves_out_to_the_alternatives_own_interval():
     assert widening((BEYOND,), ("mass", "damping", "gain")) == pytest.approx(
         np.array([[0.0, 3.0], [2.1, 1.1], [0.0, 0.0]])
     )
+
+
+def test_a_finer_timestep_is_tried_where_its_error_explains_much_or_as_much_as_what_seems_missing():
+    step, late = term(INTEGRATION, t=3.5, explained=0.057, parameter=""), term("late", explained=0.056)
+    assert felt([late, step]) is step
+    assert felt([step]) is None and felt([replace(late, explained=0.06), step]) is None
+    assert felt([late, replace(step, t=1.9)]) is None  # chance
+    assert felt([replace(late, t=4.9), step]) is None  # it is not certain, and so is not named
+    much = replace(step, t=4.0, explained=0.1)
+    assert felt([much, replace(late, explained=0.5)]) is much and felt([replace(much, t=3.9)]) is None
 
 
 def test_intervals_and_combinations_cover_the_alternatives():

@@ -202,9 +202,16 @@ def actions_in_time(terms: Sequence[MissingTerm], control_step: float) -> bool:
 
 
 def felt(terms: Sequence[MissingTerm]) -> MissingTerm | None:
-    """The error of the integration step, where it explains so much of the residuals that it may hide other terms."""
+    """The error of the integration step, where it may hide other terms or look like one that seems to be missing.
+
+    It explains much of the residuals then, or as much as any term that is certain.
+    """
     step = integration(terms)
-    return step if step is not None and step.t >= CERTAIN_STEP and step.explained >= FELT else None
+    if step is None:
+        return None
+    most = max((each.explained for each in terms if is_certain(each) and not is_change(each.cause)), default=np.inf)
+    much = step.t >= CERTAIN_STEP and step.explained >= FELT
+    return step if much or (step.t >= SUSPICIOUS and step.explained >= most) else None
 
 
 def _numerical(terms: Sequence[MissingTerm], left: float = 1.0) -> MissingTerm | None:
