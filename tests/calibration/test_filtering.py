@@ -19,8 +19,10 @@ from madoc.identification.ensembles import (
     BEFORE,
     DRAWN,
     NOISE_ROUNDS,
+    FilteredWindows,
     likely_states,
     with_contacts_settled,
+    with_noise,
 )
 from madoc.identification.information import BOX_VARIANCE
 from madoc.identification.replay import Readings
@@ -184,9 +186,13 @@ def test_differences_lead_along_the_axes_of_the_covariance_and_not_out_of_a_rang
     np.testing.assert_allclose(wider, [3.0 * 4e-3, instruments.WIDE])
     steps, change = filtering.horizon_of(problem), problem.typical_change
     rows, point, spread = search.rows[search.block], np.array([0.0, 1.0]), np.array([[0.1, -0.1], [0.2, 0.1]])
-    log = problem, Readings.at(problem.dataset, problem.states, rows, steps, change), rows
-    sides = [Side.of(*log, point, spread, search.noise, 16, np.random.default_rng(number)) for number in (0, 1)]
+    readings = Readings.at(problem.dataset, problem.states, rows, steps, change)
+    windows = FilteredWindows(problem.dataset, problem.states, problem.simulator, readings, rows)
+    random = [np.random.default_rng(number) for number in range(3)]
+    found, _ = with_noise(windows, point, search.noise, np.zeros(4), 16, 1, random[2])
+    sides = [Side.of(windows, found, point, spread, 16, each) for each in random[:2]]
     for side in sides:
+        assert side.ends.corrections is found.corrections  # by one ensemble's gains
         np.testing.assert_allclose(side.apart, [[0.2, 0.2], [-0.2, 0.1]])  # both ends of 1 +- 0.2 and of 1 +- 0.1
         np.testing.assert_allclose(side.aside, [0.0, -0.075])
         assert side.few.shape[1] == instruments.FEW
@@ -208,7 +214,7 @@ def test_an_epoch_at_rest_tells_what_half_the_ensemble_errs_and_moves_nothing(tm
     known_well = replace(after, apart=np.array([1.0, 2.0]), compared=0, products=1e3 * told, squares=1e3 * told)
     covariance = known_well.found.uncertainty.covariance  # of one gradient alone, as there was no scatter before
     np.testing.assert_allclose(covariance, np.array([[1.0, 2.0], [2.0, 4.0]]) / (1e3 * len(told)) ** 2)
-    systems = filter_state.MEMBERS + 2 * 2 * len(problem.simulator.parameters) * instruments.FEW
+    systems = filter_state.MEMBERS // 2 + 2 * 2 * len(problem.simulator.parameters) * instruments.FEW
     large = remainder.LARGE_ROUNDS * remainder.LARGE * search.size
     assert spent == (systems * len(search.rows) + large) * filtering.horizon_of(problem)
 
@@ -231,33 +237,45 @@ def test_only_what_a_larger_ensemble_loses_too_counts_as_lost(tmp_path, monkeypa
     (after, _), spent = counted(filtering.step, problem, rest, "cauchy")
     assert asked == [search.size, 3]
     assert after.cost == pytest.approx((0.5 * (search.size - 2) + 7.0) / (search.size - 1))
-    systems = filter_state.MEMBERS + 2 * 2 * len(problem.simulator.parameters) * instruments.FEW
+    systems = filter_state.MEMBERS // 2 + 2 * 2 * len(problem.simulator.parameters) * instruments.FEW
     large = remainder.LARGE * (remainder.LARGE_ROUNDS * search.size + remainder.LARGER * 3)
     assert spent == (systems * len(search.rows) + large) * filtering.horizon_of(problem)
 
 
-def test_random_forces_are_looked_for_where_errors_last_and_are_found(tmp_path):
+def test_random_forces_are_asked_for_at_the_end_and_found(tmp_path):
     """A force of 0.4 N; the inertia that the model has, before it is calibrated, is 1 kg."""
     problem = problem_of_foot(tmp_path, force=0.4)
     search = of_contacts(problem, jax.random.key(0))
     told = np.broadcast_to(np.eye(2), (len(search.rows), 2, 2))
     truth = problem.simulator.parameters.to_unit(problem.simulator.parameters.vector(FOOT_TRUTH))
-    rest = replace(search, point=truth, wide=3, quiet=1, together=filter_state.TOGETHER, squares=told, halved=9)
-    assert rest.settled and not remainder.may_be_pushed(replace(rest, alike=remainder.LASTING))
-    state = LeastSquaresState(None, (), "filtering", replace(rest, alike=0.11), None)
-    asked = back_to_filter(state)
-    assert asked.filtered.forces == 1 and not asked.filtered.settled and not asked.finished
-    (found, _), spent = counted(filtering.step, problem, asked.filtered, "cauchy")
-    assert spent == filtering.epoch_steps(problem, asked.filtered)
-    assert found.force == pytest.approx(0.4, rel=0.25) and not found.settled and not found.squares.any()
+    search = replace(search, point=truth, noise=np.array([*NOISE.values()]) / problem.typical_change)
+    rest = replace(search, wide=3, quiet=1, together=filter_state.TOGETHER, squares=told, halved=9)
+    state = back_to_filter(LeastSquaresState(None, (), "filtering", rest, None))
+    assert state.filtered.asked == "trial" and not state.filtered.settled and not state.finished
+    (tried, _), spent = counted(filtering.step, problem, state.filtered, "cauchy")
+    assert tried.asked == "size" and spent == filtering.epoch_steps(problem, state.filtered)
+    (found, _), spent = counted(filtering.step, problem, tried, "cauchy")
+    assert spent == filtering.epoch_steps(problem, tried)
+    assert found.force == pytest.approx(0.4, rel=0.25) and not found.settled
     done = replace(found, together=filter_state.TOGETHER, moved=0.0, quiet=1, halved=9, squares=told, alike=0.9)
     assert done.settled and back_to_filter(replace(state, filtered=done)).finished  # they are looked for once
     np.testing.assert_allclose(random_forces.by_dof(problem.simulator, found.force), found.force * np.ones(2))
     (warning,) = about_surprises(problem, replace(done, alike=0.0))
-    assert f"about {found.force:.2g} to {found.force:.2g} N or N·m" in warning
+    assert f"that on along has the largest standard deviation, {found.force:.2g} N or N·m" in warning
+    known = replace(done, alike=0.0, explained_share=0.5)
+    assert known.found.unlike_noise and known.found.force == 0.0 and replace(done, alike=0.0).found.force == found.force
+    (warning,) = about_surprises(problem, known)
+    assert "state and action explain 50 % of the squares of one, as they do not of random forces" in warning
+    (warning,) = about_surprises(problem, replace(known, force=0.0))
+    assert "explain 50 % of what the model leaves of a signal" in warning
     without = problem_of_foot(tmp_path)
-    (none, _), _ = counted(filtering.step, without, replace(asked.filtered, size=12), "cauchy")
-    assert none.force == 0.0 and none.settled and none.forces == 2
+    trial = replace(state.filtered, size=12)
+    (none, _), _ = counted(filtering.step, without, trial, "cauchy")
+    assert none.force == 0.0 and none.settled and none.asked == "known"
+    doubtful = replace(trial, cost=2.0)
+    assert filtering.step(without, doubtful, "cauchy")[0].asked == "size"  # whatever the trial says
+    (none, _), _ = counted(filtering.step, without, replace(doubtful, asked="size"), "cauchy")
+    assert none.force == 0.0 and none.asked == "known" and none.settled
 
 
 def test_epochs_near_the_end_take_other_windows_and_count_together(tmp_path):

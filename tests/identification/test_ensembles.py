@@ -12,7 +12,7 @@ from madoc.calibration import CalibrationProblem
 from madoc.data import Disturbance, disturb
 from madoc.identification.ensembles import few_of, members_at
 from madoc.identification.innovations import FARTHEST, Correction, innovations
-from madoc.identification.random_forces import drawn
+from madoc.identification.random_forces import by_dof, names_of, opposed
 from madoc.identification.replay import Readings
 from robots import SPRING_TRUTH, recorded, spring
 
@@ -67,40 +67,48 @@ def test_readings_are_as_likely_as_their_errors_and_what_was_expected_of_them():
 
 
 def test_errors_that_state_and_action_explain_are_not_noise():
-    """Errors of two channels; half of the second's variance is a function of an action, and then of a speed's sign."""
-    random = np.random.default_rng(0)
-    errors, actions = random.standard_normal((1, 40, 15, 2)), random.standard_normal((40, 15, 1))
+    """Errors of three channels, the last always 0: half of the second's variance is that of an action, or of a sign."""
+    random, every = np.random.default_rng(0), np.ones(40, bool)
+    errors, actions = random.standard_normal((1, 40, 15, 3)), random.standard_normal((40, 15, 1))
+    errors[..., 2] = 0.0
     found = replace(known(errors), before=random.standard_normal((40, 15, 2)))
-    assert found.explained_by(actions) < 0.02
+    assert found.explained_by(actions, every) < 0.03
     errors[0, ..., 1] += actions[..., 0]
-    assert replace(found, mean=errors).explained_by(actions) == pytest.approx(0.5, abs=0.07)
+    driven = replace(found, mean=errors)
+    assert driven.explained_by(actions, every) == pytest.approx(0.5, abs=0.07)
+    assert driven.explained_by(actions, np.arange(40) < 13) == 0.0  # 195 readings do not tell
     errors[0, ..., 1] += np.sign(found.before[..., 0]) - actions[..., 0]
-    assert replace(found, mean=errors).explained_by(actions) > 0.3
+    assert replace(found, mean=errors).explained_by(actions, every) > 0.3
     forces = np.stack([random.standard_normal((40, 15)), 3.0 * actions[..., 0] + random.standard_normal((40, 15))], -1)
-    assert replace(found, pushed=1e-3 * forces).explained_by(actions) == pytest.approx(0.9, abs=0.03)
-    assert replace(found, pushed=forces[..., :1]).explained_by(actions) < 0.02  # where forces act, these are asked
+    assert replace(found, pushed=1e-3 * forces).explained_by(actions, every) == pytest.approx(0.9, abs=0.03)
+    assert (
+        replace(found, pushed=forces[..., :1]).explained_by(actions, every) < 0.03
+    )  # where forces act, these are asked
 
 
 def test_what_readings_tell_of_random_forces_is_their_mean_given_these():
     """Of a slide that is read almost without noise each reading tells the force, which is at random."""
     task = spring(max_episode_steps=100)
-    log = recorded(task, SPRING_TRUTH, 200, jax.random.key(0), force=0.3)
+    log = recorded(task, SPRING_TRUTH, 600, jax.random.key(0), force=0.3)
     problem, simulator = CalibrationProblem(log, simulation.make(task, threads=1)), simulation.make(task, threads=1)
-    rows = np.arange(0, 180, 10)
-    readings = Readings.at(log, problem.states, rows, 8, problem.typical_change)
-    truth, random = task.parameters.to_unit(task.parameters.vector(SPRING_TRUTH)), np.random.default_rng(0)
+    rows = np.arange(0, 600, 20)
+    readings = Readings.at(log, problem.states, rows, 18, problem.typical_change)
+    truth = task.parameters.to_unit(task.parameters.vector(SPRING_TRUTH))
     members = np.repeat(problem.states.states[rows][:, None], 40, axis=1)
-    forces = drawn(np.array([0.3]), (len(rows), 40, 8), random)
+    forces = opposed(np.array([0.3]), len(rows), 40, 18, np.random.default_rng(0))
+    assert forces.mean(1) == pytest.approx(0.0, abs=1e-15) and forces.std() == pytest.approx(0.3, rel=0.02)
     found = innovations(simulator, readings, truth[None], members, 1e-4 * np.ones(2), forces=forces)
     told = found.pushed[:, :, 0]
-    assert told.std() == pytest.approx(0.3, rel=0.2) and found.explained_by(readings.actions) < 0.05
+    assert told.std() == pytest.approx(0.3, rel=0.2)
+    assert found.explained_by(readings.actions, np.ones(len(rows), bool)) < 0.05
     system = simulator.bind(simulator.parameters.to_physical(truth)[None])
     state, after = (problem.states.states[rows + each][None] for each in (0, 1))
-    alone, pushed = (
-        system.step(state, readings.actions[None, :, 0], each) for each in (None, np.ones((1, len(rows), 1)))
-    )
+    every = None, np.ones((1, len(rows), 1))
+    alone, pushed = (system.step(state, readings.actions[None, :, 0], each) for each in every)
     exact = ((after - alone) / (pushed - alone))[0, :, 1]
     np.testing.assert_allclose(told[:, 0], exact, atol=1e-3)
+    assert by_dof(simulator, 0.3) == pytest.approx(0.3 * np.sqrt(task.model.dof_M0)) and not len(by_dof(simulator, 0.0))
+    assert names_of(simulator) == ["slide"]
 
 
 def test_predictions_leave_errors_alike_only_where_windows_agree():

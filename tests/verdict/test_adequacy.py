@@ -27,6 +27,7 @@ from madoc.verdict.adequacy import (
     missing_term,
     numerical,
     of_small_terms,
+    to_remove,
     widening,
     with_widened_intervals,
 )
@@ -57,14 +58,16 @@ def test_each_end_moves_out_to_the_alternatives_own_interval():
     )
 
 
-def test_a_finer_timestep_is_tried_where_its_error_explains_much_or_as_much_as_what_seems_missing():
+def test_terms_are_tested_without_the_error_of_the_timestep_where_it_explains_much_or_as_much_as_any():
     step, late = term(INTEGRATION, t=3.5, explained=0.057, parameter=""), term("late", explained=0.056)
-    assert felt([late, step]) is step
-    assert felt([step]) is None and felt([replace(late, explained=0.06), step]) is None
-    assert felt([late, replace(step, t=1.9)]) is None  # chance
-    assert felt([replace(late, t=4.9), step]) is None  # it is not certain, and so is not named
+    assert to_remove([late, step]) is step and felt([late, step]) is None
+    assert to_remove([step]) is None and to_remove([replace(late, explained=0.06), step]) is None
+    assert to_remove([late, replace(step, t=1.9)]) is None  # chance
+    assert to_remove([replace(late, t=4.9), step]) is None  # it is not certain, and so is not named
+    assert to_remove([replace(late, explained=0.019), replace(step, explained=0.019)]) is None  # too little to be named
     much = replace(step, t=4.0, explained=0.1)
-    assert felt([much, replace(late, explained=0.5)]) is much and felt([replace(much, t=3.9)]) is None
+    assert to_remove([much, replace(late, explained=0.5)]) is much and felt([much]) is much
+    assert to_remove([replace(much, t=3.9)]) is None
 
 
 def test_intervals_and_combinations_cover_the_alternatives():

@@ -126,11 +126,12 @@ class Estimate:
         quantile: Standard errors in half of such an interval, before an end of the range cuts it off.
         settled: False where the method can tell that its search is not at its end, so that a larger budget would change
             the estimate: least squares until its steps are small, Madoc until its discriminators can have settled.
-        unlike_noise: Whether residuals have longer tails than noise has, or each is like the next: the model does not
-            explain the log, and the intervals do not count that. False where the method does not estimate the noise.
+        unlike_noise: Whether residuals have longer tails than noise has, are each like the next, or follow from state
+            and action: the model does not explain the log, and the intervals do not count that. False where the method
+            does not estimate the noise.
         effective: Whether the model leaves more than noise, and the estimate is the one that predicts best with it.
-        random_forces: Standard deviation of random forces on each degree of freedom, in N or N·m, a new one in each
-            control step, that act on the machine beside what the model has; empty where none were found.
+        random_forces: Standard deviation of random forces on each degree of freedom of the model, in its order, in N or
+            N·m, new ones in each control step, that act on the machine besides; empty where none were found.
         group_stability: Mean adjusted Rand index of the groups with those found from resampled states, or proposed in
             other epochs; 1 is the same groups, 0 chance. None where groups were not found from the problem.
     """

@@ -11,6 +11,7 @@ from madoc.calibration.registry import CALIBRATORS
 from madoc.calibration.result import CalibrationResult, ParameterEstimate
 from madoc.evaluation import calibration_error
 from madoc.identification.combinations import combinations
+from madoc.identification.random_forces import names_of
 from madoc.parameters import Parameter, ParameterSpace
 from madoc.runs import loop
 from madoc.runs.budget import Budget
@@ -94,7 +95,7 @@ def calibrate(
         settled=estimate.settled,
         unlike_noise=estimate.unlike_noise,
         effective=estimate.effective,
-        random_forces=estimate.random_forces.tolist(),
+        random_forces=dict(zip(names_of(problem.simulator), estimate.random_forces.tolist(), strict=False)),
         group_stability=estimate.group_stability,
         problem=problem,
     )

@@ -86,8 +86,8 @@ class OpenLoop:
             make.
         relative_interval: 95 % confidence interval of that, by resampling episodes, or stretches where these are few.
         beside_noise: How many times as large the error at the estimate is, at least, as that which the sensors' noise,
-            random forces where predictions begin at logged states, and the estimate's uncertainty make; for each
-            signal, the lower end of a 95 % interval.
+            random forces (those read off the log where predictions begin at logged states, else those that an ensemble
+            filter found), and the estimate's uncertainty make; for each signal, the lower end of a 95 % interval.
     """
 
     seconds: float

@@ -71,10 +71,11 @@ class CalibrationResult:
         covariance: Covariance of the estimates in physical units, in the task's order; None where it is unknown.
         combinations: Sums and products of parameters that the log tells though it leaves each of them open.
         settled: False where the method can tell that its search is not at its end; its intervals mean nothing before.
-        unlike_noise: Whether residuals have longer tails than noise has, or each is like the next.
+        unlike_noise: Whether residuals have longer tails than noise has, are each like the next, or follow from state
+            and action.
         effective: Whether the model leaves more than noise, and the estimate is the one that predicts best with it.
-        random_forces: Standard deviation of random forces on each degree of freedom, in N or N·m, a new one in each
-            control step, that act on the machine beside what the model has; empty where none were found.
+        random_forces: Standard deviation of random forces by degree of freedom, in N or N·m, new ones in each control
+            step, that act on the machine besides what the model has; empty where none were found.
         group_stability: How alike groups of resampled states are: their mean adjusted Rand index, 1 for the same
             groups, 0 for chance; None where the method did not find groups.
         chosen: Why `auto` took this method, in a sentence; None where the method was named.
@@ -102,7 +103,7 @@ class CalibrationResult:
     settled: bool = True
     unlike_noise: bool = False
     effective: bool = False
-    random_forces: list[float] = field(default_factory=list)
+    random_forces: dict[str, float] = field(default_factory=dict)
     judging_seconds: float = field(default=0.0, compare=False)
     group_stability: float | None = None
     chosen: str | None = None

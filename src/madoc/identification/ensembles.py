@@ -18,7 +18,7 @@ from madoc.data.timescale import stride
 from madoc.data.velocities import moving_states
 from madoc.identification.innovations import Innovations, innovations
 from madoc.identification.noise import difference_noise
-from madoc.identification.random_forces import by_dof, drawn
+from madoc.identification.random_forces import by_dof, opposed
 from madoc.identification.replay import Readings
 from madoc.identification.settling import settled_to_noise, window_costs
 from madoc.identification.states import LoggedStates, completed
@@ -82,9 +82,10 @@ def with_noise(
     rounds · windows · members · steps control steps.
     """
     dataset, logged, simulator, readings, rows = windows
+    (of_forces,) = random.spawn(1)  # members are the same with any forces
     for _ in range(rounds):
         members = members_at(dataset, logged, simulator, rows, noise * readings.scale, count, random)
-        forces = drawn(by_dof(simulator, force), (*members.shape[:2], readings.steps), random)
+        forces = opposed(by_dof(simulator, force), len(rows), count, readings.steps, of_forces)
         found = innovations(simulator, readings, point[None], members, noise, first=SPOILT, forces=forces)
         noise = next_noise(noise, found.noise_ratio(), rounding)
     return found, noise

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from madoc.identification.losses import Loss
 from madoc.identification.replay import Readings
 from madoc.identification.settling import FAILED_WINDOW, window_costs
-from madoc.identification.systematic import explained_each
+from madoc.identification.systematic import explained_each, folds_of
 from madoc.simulation.attitudes import differences
 from madoc.simulation.base import Simulator
 
@@ -18,6 +18,9 @@ FARTHEST = 4.0
 """Standard deviations of an innovation, beyond which the states follow it no farther: a false reading says nothing."""
 CLIP, OF_CLIPPED = 3.0, 0.9950
 """Standard deviations at which errors are clipped, and the mean square of a normal value that is."""
+FEWEST_EXPLAINED = 200
+"""Least number of readings of which it is asked whether state and action explain errors; by chance they explain a few
+percent of as many."""
 _SMALLEST = 1e-100
 
 
@@ -52,6 +55,16 @@ class Correction(NamedTuple):
         gain = np.swapaxes(around, -1, -2) @ shown / freedom @ np.swapaxes(inverse, -1, -2)
         far = np.abs(observed @ np.swapaxes(inverse, -1, -2))[..., 0, :]
         return cls(factor, inverse, gain, gain @ np.linalg.inv(factor + one), FARTHEST / np.maximum(far, FARTHEST))
+
+    def of_others(
+        self,
+        values: Float[np.ndarray, "*rows members others"],
+        apart: Float[np.ndarray, "*rows members channels"],
+    ) -> "Correction":
+        """The correction of other values than the states, of mean 0, as the forces on them, that are as far `apart`."""
+        shown = apart - apart.mean(-2, keepdims=True)
+        gain = np.swapaxes(values, -1, -2) @ shown / (shown.shape[-2] - 1) @ np.swapaxes(self.inverse, -1, -2)
+        return self._replace(gain=gain)
 
     def follow(
         self,
@@ -136,18 +149,26 @@ class Innovations:
         certain = pairs.mean(0) - 2.0 * pairs.std(0, ddof=1) / np.sqrt(len(pairs))
         return float((certain / np.maximum(squares, _SMALLEST)).max(initial=0.0))
 
-    def explained_by(self, actions: Float[np.ndarray, "windows steps action"]) -> float:
+    def explained_by(
+        self, actions: Float[np.ndarray, "windows steps action"], kept: Bool[np.ndarray, " windows"]
+    ) -> float:
         """The largest share of a channel's whitened errors, or of a random force, that state and action explain.
 
-        It is that of the first system, outliers clipped; 0 for right predictions, whose errors depend on nothing that
-        was known before. Where random forces act, what readings tell of them is asked, not errors of all noise.
+        It is that of the first system in the windows kept, outliers clipped; 0 for right predictions, whose errors
+        depend on nothing that was known before, and where windows are too few to tell. Where random forces act, what
+        readings tell of them is asked, not errors of all noise.
         """
-        whole, first = self.whole[0], self.first
-        inputs = np.concatenate([self.before, actions], axis=-1)[whole, first:]
-        values = self.pushed if self.pushed.size else np.clip(self.whitened[0], -CLIP, CLIP)
-        columns = values[whole, first:].reshape(-1, values.shape[-1])
-        columns = columns / np.maximum(columns.std(0), _SMALLEST)
-        return float(explained_each(inputs.reshape(-1, inputs.shape[-1]), columns).max(initial=0.0))
+        kept, first = kept & self.whole[0], self.first
+        inputs = np.concatenate([self.before, actions], axis=-1)[kept, first:]
+        values = (self.pushed if self.pushed.size else np.clip(self.whitened[0], -CLIP, CLIP))[kept, first:]
+        rows = inputs.shape[0] * inputs.shape[1]
+        if rows < FEWEST_EXPLAINED:
+            return 0.0
+        columns = values.reshape(rows, values.shape[-1])
+        columns = columns[:, columns.std(0) > 0.0]
+        folds = folds_of(np.repeat(np.arange(len(inputs)), inputs.shape[1]))
+        shares = explained_each(inputs.reshape(rows, -1), columns / columns.std(0), folds)
+        return float(shares.max(initial=0.0))
 
     def noise_ratio(self) -> Float[np.ndarray, " channels"]:
         """Mean square of each channel's prediction errors over their variance, outliers clipped; 1 if they are all 0.
@@ -209,8 +230,7 @@ def innovations(
             correction = Correction.of(moving[0], apart[0])
             corrections.append(correction)
             if forces is not None:
-                acting = forces[:, :, step]
-                pushed[:, step] = acting.mean(1) + Correction.of(acting, apart[0]).of_mean(apart[0])
+                pushed[:, step] = correction.of_others(forces[:, :, step], apart[0]).of_mean(apart[0])
         else:
             correction = Correction(*(each[:, step] for each in like.corrections))
         grouped[..., :physical] = correction.follow(moving, apart)

@@ -1,4 +1,4 @@
-"""Random forces on a machine, as gusts, uneven floors and cogging make: what no sensor's noise explains.
+"""Random forces on a machine, as turbulence, a rough floor and vibration make: what no sensor's noise explains.
 
 A filter that does not know them believes its own predictions too much. Its errors then last over several readings, and
 parameters take what forces have done. Their size is what makes readings likeliest, beside that of the sensors' noise
@@ -20,11 +20,29 @@ def by_dof(simulator: Simulator, size: float) -> Float[np.ndarray, " dof"]:
     return np.asarray(size * np.sqrt(simulator.task.model.dof_M0)) if size else np.zeros(0)
 
 
-def drawn(
+def names_of(simulator: Simulator) -> list[str]:
+    """Names of the degrees of freedom: that of the joint, with a number behind it where it has several."""
+    model = simulator.task.model
+    joints = [model.joint(joint).name or f"joint {joint}" for joint in model.dof_jntid]
+    return [
+        f"{joint}[{dof - model.jnt_dofadr[number]}]" if joints.count(joint) > 1 else joint
+        for dof, (joint, number) in enumerate(zip(joints, model.dof_jntid, strict=True))
+    ]
+
+
+def forces(
     deviations: Float[np.ndarray, " dof"], shape: tuple[int, ...], random: np.random.Generator
 ) -> Float[np.ndarray, "*shape dof"] | None:
     """Forces that are independent of each other; None, and no number drawn, where none act."""
     return deviations * random.standard_normal((*shape, len(deviations))) if deviations.any() else None
+
+
+def opposed(
+    deviations: Float[np.ndarray, " dof"], windows: int, members: int, steps: int, random: np.random.Generator
+) -> Float[np.ndarray, "windows members steps dof"] | None:
+    """Forces on an even number of members in pairs of opposite ones, so that their mean is 0; None where none act."""
+    half = forces(deviations, (windows, members // 2, steps), random)
+    return None if half is None else np.concatenate([half, -half], axis=1)
 
 
 def largest(dataset: Dataset, logged: LoggedStates, simulator: Simulator) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from sklearn.ensemble import ExtraTreesRegressor
 from sklearn.linear_model import RidgeCV
-from sklearn.model_selection import KFold, cross_val_predict
+from sklearn.model_selection import GroupKFold, KFold, cross_val_predict
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from threadpoolctl import threadpool_limits
@@ -72,14 +72,19 @@ def explained(
 
 
 def explained_each(
-    inputs: Float[np.ndarray, "rows inputs"], residuals: Float[np.ndarray, "rows observation"]
+    inputs: Float[np.ndarray, "rows inputs"], residuals: Float[np.ndarray, "rows observation"], folds: Folds
 ) -> Float[np.ndarray, " observation"]:
-    """The same share of every channel by itself, by the regression that explains it best."""
+    """The same share of every channel by itself, none of which is always 0, by the regression that explains it best."""
     shares = np.zeros(residuals.shape[1])
-    for guess in _guesses(inputs, residuals, None):
-        left, total = ((residuals - guess) ** 2).sum(0), (residuals**2).sum(0)
-        shares = np.maximum(shares, 1.0 - left / np.maximum(total, np.finfo(float).tiny))
+    for guess in _guesses(inputs, residuals, folds):
+        shares = np.maximum(shares, 1.0 - ((residuals - guess) ** 2).sum(0) / (residuals**2).sum(0))
     return shares
+
+
+def folds_of(groups: Int[np.ndarray, " rows"]) -> Folds:
+    """Fifths of the groups, in rows: none is predicted from rows of its own group. None where there are too few."""
+    count = len(np.unique(groups))
+    return list(GroupKFold(FOLDS).split(groups, groups=groups)) if count >= _FEWEST else []
 
 
 def _guesses(
@@ -88,12 +93,13 @@ def _guesses(
     """What each regression predicts of residuals; nothing where there are too few, or all are rounding."""
     folds = list(KFold(FOLDS).split(inputs)) if folds is None and len(inputs) >= _FEWEST else folds or []
     enough = folds and min(len(learnt) for learnt, _ in folds) >= _FEWEST
-    if not enough or np.sqrt((residuals**2).mean(0)).max() <= _ROUNDING:
+    if not enough or np.sqrt((residuals**2).mean(0)).max(initial=0.0) <= _ROUNDING:
         return
     wanted = residuals.ravel() if residuals.shape[1] == 1 else residuals
     for make in EXPLAINERS.values():
         with threadpool_limits(1):  # the same bits on any number of cores, and no threads that wait for each other
-            yield cross_val_predict(make(), inputs, wanted, cv=folds).reshape(residuals.shape)
+            guess = cross_val_predict(make(), inputs, wanted, cv=folds).reshape(residuals.shape)
+        yield guess
 
 
 def explained_at_end(

@@ -202,16 +202,20 @@ def actions_in_time(terms: Sequence[MissingTerm], control_step: float) -> bool:
 
 
 def felt(terms: Sequence[MissingTerm]) -> MissingTerm | None:
-    """The error of the integration step, where it may hide other terms or look like one that seems to be missing.
-
-    It explains much of the residuals then, or as much as any term that is certain.
-    """
+    """The error of the integration step, where it explains so much of the residuals that it may hide other terms."""
     step = integration(terms)
-    if step is None:
-        return None
-    most = max((each.explained for each in terms if is_certain(each) and not is_change(each.cause)), default=np.inf)
-    much = step.t >= CERTAIN_STEP and step.explained >= FELT
-    return step if much or (step.t >= SUSPICIOUS and step.explained >= most) else None
+    return step if step is not None and step.t >= CERTAIN_STEP and step.explained >= FELT else None
+
+
+def to_remove(terms: Sequence[MissingTerm]) -> MissingTerm | None:
+    """The error of the integration step, where other terms are to be tested without it.
+
+    It is `felt`, or it may be what a certain term seems to be, as it explains at least as much as any of them.
+    """
+    step, certain = integration(terms), [each for each in terms if is_certain(each) and not is_change(each.cause)]
+    most = max((each.explained for each in certain), default=np.inf)
+    may_be_it = step is not None and step.t >= SUSPICIOUS and step.explained >= max(WORTH_NAMING, most)
+    return step if may_be_it else felt(terms)
 
 
 def _numerical(terms: Sequence[MissingTerm], left: float = 1.0) -> MissingTerm | None:

@@ -86,7 +86,7 @@ def assess(
     # starts they take much of the time.
     half = (bench.simulator.parameters.high - bench.simulator.parameters.low) / 2.0
     covariance = None if result.covariance is None else result.covariance / np.outer(half, half)
-    predict = partial(_predictions, bench, point, fits_starts, covariance, np.array(result.random_forces))
+    predict = partial(_predictions, bench, point, fits_starts, covariance, np.array([*result.random_forces.values()]))
     predictions = None if result.settled and not fits_starts else predict()
     holdout = measured(bench, result.mean, result.interval, fits_starts=fits_starts)
     if predictions is None:

@@ -30,7 +30,7 @@ def lacking(holdout: HoldOut, *, settled: bool, unlike_noise: bool) -> Verdict |
     """The first of the ways in which a model lacks something; None where there is none.
 
     An end of a range at which a search stands that has not settled says nothing. `unlike_noise` tells that residuals
-    have longer tails than noise has, or that each is like the next.
+    have longer tails than noise has, that each is like the next, or that they follow from state and action.
     """
     holdout = holdout if settled else replace(holdout, at_end=())
     found = _missing(holdout, missing_term(holdout)) or _mismatch(holdout)
@@ -152,8 +152,9 @@ def _unlike_noise(holdout: HoldOut) -> Verdict | None:
     return Verdict(
         "MODEL_MISMATCH",
         "residuals are unlike noise (a warning says in what): the model does not explain the whole log, and intervals "
-        f"count noise alone{_where(holdout)}; look for a force that acts at times only, at contacts "
-        "or in fast motion, for wrong or missing readings and for values that differ between runs"
+        f"count noise alone{_where(holdout)}; look for a force that depends on the motion, as drag does, or acts at "
+        "times only, at contacts or in fast motion, for wrong or missing readings and for values that differ between "
+        "runs"
         f"{about_timestep(holdout)}",
     )
 

@@ -2,8 +2,8 @@
 
 The simulator starts where the log does, gets the logged actions, and runs on. Its errors after a tenth of a second, a
 second and whole runs stand beside those of the user's own model as it was given, and of mid-range. They also stand
-beside those that chance would make: the sensors' noise, random forces where starts are logged, and the estimate's
-uncertainty.
+beside those that chance would make: the sensors' noise, random forces (those that are read off the log where starts are
+logged, and else those that an ensemble filter found), and the estimate's uncertainty.
 """
 
 from dataclasses import replace
@@ -242,10 +242,15 @@ def _imitated(
     """
     random, readings, windows = np.random.default_rng(0), replays.readings, np.arange(len(replays.readings))
     drawn = _drawn(point, covariance)
-    pushes = random_forces.drawn(forces, (IMITATED, len(windows), readings.steps), np.random.default_rng(1))
+    pushes = random_forces.forces(forces, (IMITATED, len(windows), readings.steps), np.random.default_rng(1))
     begun = np.repeat(states[None], IMITATED, axis=0)
     made = replays.residuals_from(drawn, begun, pushes)[windows % IMITATED, windows]
-    noise = residual_noise(residuals[:, : replays.fitted + 1], made.shape[-1])
+    left = residuals[:, : replays.fitted + 1]
+    noise = residual_noise(left, made.shape[-1])
+    if (
+        forces.any()
+    ):  # what they did to the fitted readings lasts; noise alone is in the differences of consecutive ones
+        noise = np.minimum(noise, np.sqrt(np.nanmean(np.diff(left, axis=1) ** 2, axis=(0, 1)) / 2.0))
     made = np.where(np.isfinite(made), made, 0.0) + noise * random.standard_normal(made.shape)
     observed = moved(bench.simulator.task.attitudes, readings.observed, made * readings.scale)
     return replace(replays, readings=replace(readings, observed=observed)).residuals(point[None])

@@ -81,15 +81,11 @@ def noisy_contacts(bench: Bench, point: Float[np.ndarray, " d"]) -> bool:
     count.
     """
     states, rows = logged_states(bench.held_out, bench.simulator.task)
-    places = evenly(np.arange(len(states)), MOST_ROWS)
-    seen, of_seen = states[places], rows[places]
     follows = consecutive_rows(bench.held_out, rows)
     first = rows[evenly(follows[np.isin(follows - 1, follows)], MOST_ROWS)]
     if not len(first):
         return False
-    contacts = bench.simulator.contacts(seen, bench.simulator.parameters.to_physical(point.clip(-1.0, 1.0)))
-    windows = of_seen // bench.replays.windows.steps
-    if len(np.unique(windows[contacts > 0])) < TOUCHING * len(np.unique(windows)):
+    if _touching(bench, point, states, rows) < TOUCHING:
         return False
     pairs = np.stack([_residuals(bench, point, each) for each in (first, first + 1)])
     whole, actions = np.isfinite(pairs).all((0, 2)), np.asarray(bench.held_out.transitions.action)
@@ -98,6 +94,20 @@ def noisy_contacts(bench: Bench, point: Float[np.ndarray, " d"]) -> bool:
         return False
     left = [_without(pairs[each, whole], actions[first[whole] + each - 1]) for each in (0, 1)]
     return min(sensors.alternation(*pairs[:, whole]), sensors.alternation(*left)) > sensors.NOISY
+
+
+def _touching(
+    bench: Bench,
+    point: Float[np.ndarray, " d"],
+    states: Float[np.ndarray, "rows state"],
+    rows: Int[np.ndarray, " rows"],
+) -> float:
+    """The share of windows of the hold-out, as they are replayed, in a row of which bodies touch."""
+    steps = bench.replays.windows.steps
+    windows = evenly(bench.replays.rows, max(1, MOST_ROWS // steps))[:, None] + np.arange(steps)
+    seen = np.isin(rows, windows)
+    contacts = bench.simulator.contacts(states[seen], bench.simulator.parameters.to_physical(point.clip(-1.0, 1.0)))
+    return float(np.isin(windows, rows[seen][contacts > 0]).any(1).mean())
 
 
 def _without(

@@ -33,6 +33,7 @@ from madoc.verdict.adequacy import (
     is_certain,
     missing_term,
     of_small_terms,
+    to_remove,
     widening,
     worth_naming,
 )
@@ -66,7 +67,8 @@ def _doubts(
 ) -> tuple[Suspicions, bool]:
     """What the log says against the model, and whether that was tested with a finer integration step.
 
-    Where the error of the integration step explains much, it hides other terms or looks like them. These are then
+    Where the error of the integration step explains much, or as much as any certain term, it may hide others or look
+    like one. These are then
     tested with steps of a quarter of the length, unless their error explains much there too. A log that tells neither
     states nor what is needed to fit them cannot be tested, nor can one without pairs of consecutive observations. Under
     a limit of time windows are as many as that allows. With `shorter` they are so many times as short and as many.
@@ -88,7 +90,7 @@ def _doubts(
     doubts = suspicions(*given, problem.simulator, point, half_widths, bench.change, most=most, shorter=shorter)
     alternatives = in_full((*doubts.alternatives, *of_small_terms(doubts.terms)), doubts.terms)
     doubts = replace(doubts, alternatives=alternatives)
-    step = felt(doubts.terms)
+    step = to_remove(doubts.terms)
     if step is None or task.source is None:
         return doubts, False
     if not bench.begins("the same tests with a finer timestep", FINER * doubts.control_steps / bench.rate):

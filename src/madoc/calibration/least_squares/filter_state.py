@@ -1,6 +1,7 @@
 """The state of the search by an ensemble filter (`filtering`): where it is, and what its windows have told so far."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import jax
 import numpy as np
@@ -55,9 +56,10 @@ class FilterState:
         epochs: Number of epochs.
         failures: Number of windows whose simulation failed.
         force: Size of random forces in N/√kg (`random_forces`), 0 until these are looked for.
-        forces: 0 until random forces are asked for, 1 where the next step looks for them, 2 after that.
-        known: Share in [0, 1] of prediction errors, or of random forces, that state and action explain; 0 until the
-            end (`Innovations.explained_by`).
+        asked: What is asked of random forces: `nothing` until the search has settled, in the next step by a `trial`
+            whether any act, then of which `size` they are, and nothing after that, when it is `known`.
+        explained_share: Share in [0, 1] of prediction errors, or of random forces, that state and action explain
+            (`Innovations.explained_by`); 0 until the end.
     """
 
     point: Float[np.ndarray, " d"]
@@ -85,8 +87,8 @@ class FilterState:
     epochs: int = 0
     failures: int = 0
     force: float = 0.0
-    forces: int = 0
-    known: float = 0.0
+    asked: Literal["nothing", "trial", "size", "known"] = "nothing"
+    explained_share: float = 0.0
 
     @property
     def blocks(self) -> int:
@@ -124,8 +126,13 @@ class FilterState:
 
     @property
     def settled(self) -> bool:
-        """Whether the search is at its end, and the error of finite ensembles is known."""
-        return self.at_rest and self.to_compare <= 0 and self.forces != 1
+        """Whether the search is at its end, the error of finite ensembles is known, and nothing is asked of forces."""
+        return self.at_rest and self.to_compare <= 0 and self.asked in ("nothing", "known")
+
+    @property
+    def unlike_noise(self) -> bool:
+        """Whether errors at the end have long tails, are each like the next, or follow from state and action."""
+        return self.cost > LONG_TAILS or self.alike > WHITE or self.explained_share > EXPLAINED
 
     @property
     def near(self) -> bool:
@@ -140,5 +147,6 @@ class FilterState:
         bread = agreed(products, squares) * np.outer(told, told)
         error = beyond_chance(self.apart, self.chance, self.compared)
         uncertainty = sandwich(bread, self.meat + np.outer(error, error))
-        unlike_noise = self.settled and (self.cost > LONG_TAILS or self.alike > WHITE or self.known > EXPLAINED)
-        return Found(self.point, uncertainty, self.explained, self.settled, unlike_noise, self.force)
+        unlike_noise, at_random = self.settled and self.unlike_noise, self.explained_share <= EXPLAINED
+        force = self.force if self.settled and at_random else 0.0
+        return Found(self.point, uncertainty, self.explained, self.settled, unlike_noise, force)

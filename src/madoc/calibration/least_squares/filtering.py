@@ -31,7 +31,9 @@ from madoc.calibration.least_squares.remainder import (
     LARGE,
     LARGE_ROUNDS,
     size_steps,
+    trial_steps,
     with_random_forces,
+    with_trial,
     with_what_is_left,
 )
 from madoc.calibration.least_squares.statistics import touched
@@ -73,7 +75,7 @@ FIRST_NOISE = 0.1
 NOISE_SETTLED = 0.4
 """Relative change of noise variances, root of the mean square, below which they are as good as known."""
 NOISE_ROUNDS = 3
-"""Number of runs of an ensemble before each of the first epochs, which tell the noise better at little cost."""
+"""Number of runs of an ensemble in each of the first epochs, which tell the noise better at little cost."""
 TOUCHING = 0.05
 """Share in [0, 1] of windows in which bodies touch, from which on the log is one of contacts."""
 FEW_TOUCH = (0.25, 0.5)
@@ -137,15 +139,15 @@ def of_contacts(
 
 def epoch_steps(problem: CalibrationProblem, state: FilterState) -> int:
     """Control steps of the next epoch, but for windows lost in the last one; at rest no step is tried."""
-    if state.forces == 1:
+    if state.asked == "trial":
+        return trial_steps(min(state.size, len(state.rows)), state.horizon)
+    if state.asked == "size":
         return size_steps(min(state.size, len(state.rows)), state.horizon)
-    members, tried = state.members, 0 if state.at_rest else 1 + len(TRIALS)
-    few = (2 * 2 * len(problem.simulator.parameters) + tried) * FEW
-    alone = 0 if state.wide else NOISE_ROUNDS * members
-    if state.at_rest and state.to_compare == 1:
-        alone += LARGE_ROUNDS * LARGE
+    tried, rounds = 0 if state.at_rest else 1 + len(TRIALS), 1 if state.wide else NOISE_ROUNDS
+    systems = rounds * state.members + (2 * 2 * len(problem.simulator.parameters) + tried) * FEW
     windows = len(state.rows[state.block])
-    return (alone * min(windows, state.size) + (2 * members + few) * windows) * state.horizon
+    large = LARGE_ROUNDS * LARGE * min(windows, state.size) if state.at_rest and state.to_compare == 1 else 0
+    return (systems * windows + large) * state.horizon
 
 
 def whole_run(problem: CalibrationProblem, state: FilterState) -> int:
@@ -167,14 +169,16 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
     random = [np.random.default_rng([state.seed, state.epochs, number]) for number in range(3)]
     windows = FilteredWindows(problem.dataset, problem.states, problem.simulator, readings, rows)
     some = windows.of(np.arange(min(state.size, len(rows))))
-    if state.forces == 1:
-        return with_random_forces(some, state, rounding), Epoch({"moved": state.moved})
-    if not state.wide:
-        how = rounding, count, NOISE_ROUNDS, random[2], state.force
-        state = replace(state, noise=with_noise(windows, state.point, state.noise, *how)[1])
-    given = problem, readings, rows, state.point, state.spread, state.noise, count
+    if state.asked == "trial":
+        return with_trial(some, state, rounding), Epoch({})
+    if state.asked == "size":
+        return with_random_forces(some, state, rounding), Epoch({})
+    rounds = 1 if state.wide else NOISE_ROUNDS
+    found, _ = with_noise(windows, state.point, state.noise, rounding, count, rounds, random[2], state.force)
+    state = replace(state, noise=found.noise)
+    given = windows, found, state.point, state.spread, count
     sides = [Side.of(*given, each, state.force) for each in random[:2]]
-    whole = np.logical_and(*(each.found.whole[0] & each.ends.whole.all(0) for each in sides))
+    whole = found.whole[0] & sides[0].ends.whole.all(0) & sides[1].ends.whole.all(0)
     fresh = products_of(sides[0], sides[1], whole, loss)
     if state.at_rest:
         # Errors of ensembles are in inverse proportion to their size: half errs by as much again.
@@ -209,8 +213,7 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
     meat = scores.T @ scores * seen / max(1, seen - len(state.point))
     covariance = sandwich(bread, meat).covariance
     error = np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
-    ratio = np.mean([each.found.noise_ratio() for each in sides], axis=0)
-    noise = next_noise(state.noise, 1.0 + (ratio - 1.0) / max(1, together), rounding)
+    noise = next_noise(state.noise, 1.0 + (found.noise_ratio() - 1.0) / max(1, together), rounding)
     moved, pull = moved_by(undamped, error), bread @ undamped
     quiet = bool((((noise / state.noise) ** 2 - 1.0) ** 2).mean() < NOISE_SETTLED**2)
     refused = not np.array_equal(taken, np.clip(undamped, -LONGEST, LONGEST))
@@ -225,7 +228,7 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
         squares=squares,
         meat=meat + np.outer(pull, pull),
         moved=max(moved, LIKE_CHANCE) if refused else moved,
-        cost=float(np.mean([over_windows(surprises(each.found, loss)) for each in sides])),
+        cost=over_windows(surprises(found, loss)),
         wide=state.wide + 1 if state.wide else int(state.epochs + 1 >= EARLY_EPOCHS or (quiet and moved < NEAR)),
         quiet=int(quiet),
         together=together,

@@ -15,16 +15,14 @@ gives the step p, with ψ the slope of the robust loss and W its weights, and th
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from scipy.stats import norm
 
-from madoc.calibration.base import CalibrationProblem
-from madoc.identification.ensembles import SPOILT, few_of, members_at
+from madoc.identification.ensembles import FilteredWindows, few_of, members_at
 from madoc.identification.innovations import Innovations, innovations
 from madoc.identification.linearisation import LEAST_CURVATURE
 from madoc.identification.losses import TUNING, Loss, curvature_share, loss_slope
-from madoc.identification.random_forces import by_dof, drawn
-from madoc.identification.replay import Readings
+from madoc.identification.random_forces import by_dof, opposed
 from madoc.identification.settling import window_costs
 
 FEW = 2
@@ -48,7 +46,7 @@ class Side:
 
     Attributes:
         few: Some of its states at the first readings, with the mean and variance of all.
-        found: Prediction errors at the point.
+        found: Prediction errors at the point, of the states whose gains both ensembles follow readings by.
         ends: Those of few states at the ends of differences to either side of it.
         apart: The parameters' change in each difference, in rows.
         aside: How far the mean of its ends is from the point.
@@ -65,33 +63,27 @@ class Side:
     @classmethod
     def of(
         cls,
-        problem: CalibrationProblem,
-        readings: Readings,
-        rows: Int[np.ndarray, " windows"],
+        windows: FilteredWindows,
+        found: Innovations,
         point: Float[np.ndarray, " d"],
         spread: Float[np.ndarray, "d d"],
-        noise: Float[np.ndarray, " channels"],
         count: int,
         random: np.random.Generator,
         force: float = 0.0,
     ) -> "Side":
         """An ensemble of so many states, and differences to either side of the point, not out of a range.
 
-        `spread` are the differences in columns, in [-1, 1], and `noise` is in typical changes. Random forces of size
-        `force` (`random_forces`) act on all states, on the few in pairs of opposite ones, so that their mean is 0.
+        Its few states follow readings as those of `found` did. `spread` are the differences in columns, in [-1, 1].
+        Random forces of size `force` (`random_forces`) act in pairs of opposite ones, so that their mean is 0.
         """
-        states, simulator = problem.states, problem.simulator
-        members = members_at(problem.dataset, states, simulator, rows, noise * readings.scale, count, random)
+        dataset, states, simulator, readings, rows = windows
+        members = members_at(dataset, states, simulator, rows, found.noise * readings.scale, count, random)
         few = few_of(members, FEW, states.physical_size)
+        forces = opposed(by_dof(simulator, force), len(rows), FEW, readings.steps, random)
         above, below = (np.clip(point + sign * spread.T, -1.0, 1.0) for sign in (1, -1))
-        deviations, windows = by_dof(simulator, force), len(rows)
-        forces = drawn(deviations, (windows, count, readings.steps), random)
-        half = drawn(deviations, (windows, FEW // 2, readings.steps), random)
-        on_few = None if half is None else np.concatenate([half, -half], axis=1)
-        found = innovations(simulator, readings, point[None], members, noise, first=SPOILT, forces=forces)
         both = np.concatenate([above, below])
-        ends = innovations(simulator, readings, both, few, noise, like=found, forces=on_few)
-        return cls(few, found, ends, above - below, (above + below).mean(0) / 2.0 - point, on_few)
+        ends = innovations(simulator, readings, both, few, found.noise, like=found, forces=forces)
+        return cls(few, found, ends, above - below, (above + below).mean(0) / 2.0 - point, forces)
 
     def errors(self) -> Float[np.ndarray, "windows values"]:
         """Whitened prediction errors at the point: the mean over the differences' ends, led back from theirs to it."""

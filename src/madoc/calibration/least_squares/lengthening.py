@@ -17,7 +17,6 @@ from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.filter_state import FilterState
 from madoc.calibration.least_squares.plan import FEWEST
 from madoc.calibration.least_squares.predicting import Prediction
-from madoc.calibration.least_squares.remainder import may_be_pushed
 from madoc.calibration.least_squares.search import SearchState
 from madoc.calibration.least_squares.statistics import touched
 from madoc.data import Dataset
@@ -217,7 +216,7 @@ def after_filter(problem: CalibrationProblem, state: LeastSquaresState, horizon:
     assert filtered is not None
     if not filtered.settled:
         return state
-    if not state.unknown or not filtered.found.unlike_noise:
+    if not state.unknown or filtered.asked == "known" or not filtered.unlike_noise:
         return back_to_filter(state)
     first, point, log = state.unknown[0], filtered.point, (problem.dataset, problem.states, problem.simulator)
     readings = Readings.at(problem.dataset, problem.states, first.rows, horizon, problem.typical_change)
@@ -240,15 +239,14 @@ def leaves_much_less(search: SearchState, filtered: FilterState) -> bool:
 
 
 def back_to_filter(state: LeastSquaresState) -> LeastSquaresState:
-    """The end of all with the filter's estimate, or a step by which it looks for random forces first.
+    """The end of all with the filter's estimate, once it is known whether random forces act.
 
     The data has noise then, or the model lacks something.
     """
-    state = replace(state, stage="filtering")
     assert state.filtered is not None
-    if may_be_pushed(state.filtered):
-        return replace(state, filtered=replace(state.filtered, forces=1))
-    return replace(state, finished=1)
+    if state.filtered.asked == "known":
+        return replace(state, stage="filtering", finished=1)
+    return replace(state, stage="filtering", filtered=replace(state.filtered, asked="trial"))
 
 
 def failed(state: LeastSquaresState) -> LeastSquaresState:

@@ -68,7 +68,8 @@ class Found:
         uncertainty: That of the point.
         windows: Number of independent windows that tell it.
         settled: Whether the search has come to its end.
-        unlike_noise: Whether residuals have longer tails than noise has, or each is like the next.
+        unlike_noise: Whether residuals have longer tails than noise has, are each like the next, or follow from state
+            and action.
         force: Size of random forces in N/√kg (`identification.random_forces`); 0 where none were found.
     """
 

@@ -8,23 +8,21 @@ from scipy.optimize import minimize_scalar
 
 from madoc.calibration.least_squares.filter_state import MEMBERS, NEAR, FilterState
 from madoc.calibration.least_squares.instruments import over_windows, surprises
+from madoc.calibration.least_squares.plan import FEWEST
 from madoc.calibration.least_squares.statistics import LONG_TAILS
 from madoc.identification.ensembles import FilteredWindows, with_noise
 from madoc.identification.innovations import Innovations
 from madoc.identification.losses import Loss
-from madoc.identification.noise import WHITE
 from madoc.identification.random_forces import largest
 
 LARGE, LARGE_ROUNDS, LARGER = 64, 2, 4
 """Number of states that tell at the end whether what is left is noise, as few leave errors that are alike, and how
 often noise is estimated by them. Windows that such an ensemble loses are given to one so many times as large."""
-LASTING = WHITE / 2.0
-"""Correlation of prediction errors with the next ones that is certain (`Innovations.alike`), from which on random
-forces are looked for; of noise alone it is that of a value beyond four standard errors."""
-SIZES, SIZE_ROUNDS = 8, 3
-"""Number of sizes of random forces that are tried, and how often noise is estimated for each."""
-SMALLEST_SIZE = -3.0
-"""Power of ten of the smallest size that is tried, in that of the largest."""
+TRIAL, SIZE_ROUNDS = -1.5, 2
+"""Power of ten of the size of random forces, in the largest one, with which it is asked whether any act, and how often
+noise is estimated for a size."""
+SIZES, SMALLEST_SIZE = 8, -3.0
+"""Number of sizes that are tried then, and power of ten of the smallest, in the largest."""
 BETTER = 2.0
 """Standard errors of the windows' mean by which random forces make readings likelier, as chance does not."""
 
@@ -47,13 +45,20 @@ def with_what_is_left(
         again, count = windows.of(lost), LARGER * LARGE
         larger, _ = with_noise(again, state.point, found.noise, rounding, count, 1, random, state.force)
         costs[lost] = np.minimum(costs[lost], surprises(larger, loss))
-    known = found.explained_by(windows.readings.actions)
-    return replace(state, noise=noise, cost=over_windows(costs), alike=found.alike(), known=known)
+    share = found.explained_by(windows.readings.actions, costs <= LONG_TAILS)
+    return replace(state, noise=noise, cost=over_windows(costs), alike=found.alike(), explained_share=share)
 
 
-def may_be_pushed(state: FilterState) -> bool:
-    """Whether errors at the end may be those of a filter that does not know random forces, and none were tried."""
-    return state.settled and state.forces == 0 and (state.found.unlike_noise or state.alike > LASTING)
+def trial_steps(windows: int, horizon: int) -> int:
+    """Control steps of `with_trial`."""
+    return 2 * SIZE_ROUNDS * MEMBERS * windows * horizon
+
+
+def with_trial(windows: FilteredWindows, state: FilterState, rounding: Float[np.ndarray, " channels"]) -> FilterState:
+    """The state at its end; or with random forces asked for, as some make it likelier or errors are unlike noise."""
+    none, some = (_tried(windows, state, rounding, power) for power in (-np.inf, TRIAL))
+    pushed = state.unlike_noise or _likelier(some.misfit(), none.misfit(), len(state.point))
+    return replace(state, asked="size" if pushed else "known", epochs=state.epochs + 1)
 
 
 def size_steps(windows: int, horizon: int) -> int:
@@ -66,30 +71,26 @@ def with_random_forces(
 ) -> FilterState:
     """The state with random forces of the size that makes readings likeliest, and its search to go on with them.
 
-    Where none make them certainly likelier the search is at its end as it was. Every size is tried on the same numbers.
+    Where none make them certainly likelier the search is at its end as it was. Every size is tried on the same members,
+    and judged by the windows in which no simulation failed with any.
     """
-    most, tried = largest(windows.dataset, windows.logged, windows.simulator), dict[float, Innovations]()
+    tried = {-np.inf: _tried(windows, state, rounding, -np.inf)}
 
     def misfit(power: float) -> float:
-        random, force = np.random.default_rng([state.seed, state.epochs]), most * 10.0**power
-        tried[power], _ = with_noise(windows, state.point, state.noise, rounding, MEMBERS, SIZE_ROUNDS, random, force)
-        return float(np.nanmean(tried[power].misfit()))
+        tried[power] = _tried(windows, state, rounding, power)
+        each = tried[power].misfit()
+        return float(each[np.isfinite(each)].mean()) if np.isfinite(each).any() else np.inf
 
     minimize_scalar(misfit, bounds=(SMALLEST_SIZE, 0.0), method="bounded", options={"maxiter": SIZES})
-    misfit(-np.inf)
-    best = min(tried, key=lambda power: float(np.nanmean(tried[power].misfit())))
-    change = tried[best].misfit() - tried[-np.inf].misfit()
-    change = change[np.isfinite(change)]
-    following = replace(state, forces=2, epochs=state.epochs + 1)
-    if not change.mean() < -BETTER * change.std() / np.sqrt(max(1, len(change))):
-        return following
+    misfits = {power: each.misfit() for power, each in tried.items()}
+    whole, done = np.isfinite([*misfits.values()]).all(0), replace(state, asked="known", epochs=state.epochs + 1)
+    best = min(misfits, key=lambda power: float(misfits[power][whole].sum()))
+    if not _likelier(misfits[best][whole], misfits[-np.inf][whole], len(state.point)):
+        return done
     return replace(
-        following,
-        force=float(most * 10.0**best),
+        done,
+        force=_size(windows, best),
         noise=tried[best].noise,
-        gradients=np.zeros_like(state.gradients),
-        products=np.zeros_like(state.products),
-        squares=np.zeros_like(state.squares),
         apart=np.zeros_like(state.apart),
         chance=np.zeros_like(state.chance),
         compared=0,
@@ -97,4 +98,28 @@ def with_random_forces(
         quiet=0,
         halved=0,
         together=0,
+        cost=0.0,
+        alike=0.0,
+        explained_share=0.0,
     )
+
+
+def _tried(
+    windows: FilteredWindows, state: FilterState, rounding: Float[np.ndarray, " channels"], power: float
+) -> Innovations:
+    """Prediction errors with random forces of a size, a power of ten in the largest one, and noise as it then is."""
+    random, force = np.random.default_rng([state.seed, state.epochs]), _size(windows, power)
+    return with_noise(windows, state.point, state.noise, rounding, MEMBERS, SIZE_ROUNDS, random, force)[0]
+
+
+def _size(windows: FilteredWindows, power: float) -> float:
+    """The size in N/√kg."""
+    return float(largest(windows.dataset, windows.logged, windows.simulator) * 10.0**power)
+
+
+def _likelier(misfits: Float[np.ndarray, " windows"], without: Float[np.ndarray, " windows"], parameters: int) -> bool:
+    """Whether random forces certainly make windows' readings likelier; not where too few are whole to tell."""
+    change = misfits - without
+    change = change[np.isfinite(change)]
+    enough = len(change) >= FEWEST + parameters
+    return enough and bool(change.mean() < -BETTER * change.std(ddof=1) / np.sqrt(len(change)))

@@ -9,7 +9,7 @@ from madoc.calibration.least_squares.search import SearchState
 from madoc.calibration.least_squares.statistics import EXACT, LONG_TAILS
 from madoc.data import stride
 from madoc.identification.noise import WHITE
-from madoc.identification.random_forces import by_dof
+from madoc.identification.random_forces import by_dof, names_of
 from madoc.identification.systematic import EXPLAINED
 
 MOST_LEFT_OUT = 0.05
@@ -21,14 +21,19 @@ ALIKE = (
     "what the model leaves of a reading is like what it leaves of the next (a correlation of at least {:.2f}), as "
     "noise is not: the intervals are too narrow, by how much is not known"
 )
-EXPLAINED_BY = (
-    "state and action explain {:.0%} of what the model leaves of a signal, or of the forces that make it, as they do "
-    "not of noise: the model lacks something, and the intervals are too narrow, by how much is not known"
+PREDICTABLE = (
+    "state and action explain {:.0f} % of what the model leaves of a signal, as they do not of noise: the model lacks "
+    "something, and the intervals are too narrow, by how much is not known"
+)
+NOT_RANDOM = (
+    "forces act on the machine that the model does not have, and state and action explain {:.0f} % of the squares of "
+    "one, as they do not of random forces: the model lacks something, and the intervals are too narrow, by how much is "
+    "not known"
 )
 PUSHED = (
-    "random forces that the model does not have act on the machine: about {:.2g} to {:.2g} N or N·m on a degree of "
-    "freedom, another one in each control step (`random_forces` in result.json); the intervals allow for them, and a "
-    "policy should be trained with them"
+    "random forces that the model does not have act on the machine: in each control step new ones, of which that on {} "
+    "has the largest standard deviation, {:.2g} N or N·m (result.json has all, as random_forces); the estimates allow "
+    "for them"
 )
 NOT_SETTLED = (
     "the search had not settled when it ended, and intervals do not count what is missing; take a larger budget"
@@ -77,11 +82,15 @@ def about_filtered_states(problem: CalibrationProblem, search: FilterState, *, a
 
 def about_surprises(problem: CalibrationProblem, search: FilterState) -> tuple[str, ...]:
     """Sentences on what prediction errors of an ensemble filter have that noise has not, and on random forces."""
-    unlike = [TAILS] * (search.cost > LONG_TAILS) + [ALIKE.format(search.alike)] * (search.alike > WHITE)
-    unlike += [EXPLAINED_BY.format(search.known)] * (search.known > EXPLAINED)
-    forces = by_dof(problem.simulator, search.force)
-    pushed = (PUSHED.format(forces.min(), forces.max()),) if len(forces) and search.known <= EXPLAINED else ()
-    return (*(unlike if search.found.unlike_noise else ()), *pushed)
+    about = [TAILS] * (search.cost > LONG_TAILS) + [ALIKE.format(search.alike)] * (search.alike > WHITE)
+    if search.explained_share > EXPLAINED:
+        about.append((NOT_RANDOM if search.force else PREDICTABLE).format(100.0 * search.explained_share))
+    about *= search.found.unlike_noise
+    forces = by_dof(problem.simulator, search.found.force)
+    if len(forces):
+        largest = int(forces.argmax())
+        about.append(PUSHED.format(names_of(problem.simulator)[largest], forces[largest]))
+    return tuple(about)
 
 
 def _why_states_are_not_known(problem: CalibrationProblem) -> str:
