@@ -19,6 +19,7 @@ from madoc.verdict import open_loop as module
 from madoc.verdict.mismatch import BEYOND_RANDOM
 from madoc.verdict.open_loop import MOST, as_given, beyond_imitated, open_loop
 from madoc.verdict.statistics import ABOVE_NOISE
+from robots import recorded
 
 TASK, TRUTH = ROBOTS["spring"]
 TASK = replace(TASK, velocities=1)
@@ -91,6 +92,18 @@ def test_fitted_predictions_are_as_good_as_those_of_an_imitated_hold_out_where_t
     assert max(unsure[-1].beside_noise.values()) < ABOVE_NOISE
     assert max(max(each.beside_noise.values()) for each in unsure[:-1]) < BEYOND_RANDOM
     assert not open_loop(bench, point, covariance=covariance)[0].beside_noise  # from logged states, of unknown noise
+
+
+def test_random_forces_that_were_found_act_on_an_imitated_hold_out_too():
+    train, held = recorded(TASK, TRUTH, 900, jax.random.key(0), force=0.5).split(0.4)
+    bench = Bench(CalibrationProblem(train, simulation.make(TASK, threads=1)), held, jax.random.key(0))
+    point, covariance = at_truth(bench), 1e-6 * np.eye(len(TASK.parameters))
+    known, unknown = (
+        open_loop(bench, point, fits_starts=True, covariance=covariance, forces=forces)
+        for forces in (np.array([0.5]), np.zeros(0))
+    )
+    assert max(max(each.beside_noise.values()) for each in known) < 1.1
+    assert max(max(each.beside_noise.values()) for each in unknown) > BEYOND_RANDOM
 
 
 def test_logged_predictions_are_compared_with_those_of_chance_up_to_a_second():

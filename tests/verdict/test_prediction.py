@@ -1,4 +1,5 @@
 from dataclasses import replace
+from functools import partial
 
 import jax
 import numpy as np
@@ -78,7 +79,7 @@ def test_random_forces_add_up_with_random_signs_and_a_constant_one_adds_up_to_mo
 
 
 @pytest.mark.parametrize(("noise", "noisy"), [(0.0, False), (0.05, True)])
-def test_states_are_noisy_for_contacts_where_residuals_of_single_steps_alternate(tmp_path, noise, noisy):
+def test_states_are_noisy_for_contacts_where_residuals_of_single_steps_alternate(tmp_path, monkeypatch, noise, noisy):
     task = robots.load(write_robot(tmp_path, BOUNCER_SPEC, bouncer=BOUNCER)).task
     truth = {"body_mass.trunk": 2.0, "body_mass.leg": 0.5, "dof_damping.knee": 5.0}
     log = recorded(task, truth, 1000, jax.random.key(0))
@@ -96,3 +97,7 @@ def test_states_are_noisy_for_contacts_where_residuals_of_single_steps_alternate
     assert not noisy_contacts(replace(bench, held_out=replace(held, transitions=replace(rows, **raised))), point)
     late = replace(rows, action=np.roll(np.asarray(rows.action), -1, axis=0))  # the machine acts a row later
     assert noisy_contacts(replace(bench, held_out=replace(held, transitions=late)), point) == noisy
+    for apart, many in ((30, True), (400, False)):  # a ball in flight touches in few rows and in most windows
+        touch = partial(lambda each, states, _: np.arange(len(states)) % each == 0, apart)
+        monkeypatch.setattr(type(bench.simulator), "contacts", staticmethod(touch))
+        assert noisy_contacts(bench, point) == (noisy and many)

@@ -170,9 +170,9 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
     windows = FilteredWindows(problem.dataset, problem.states, problem.simulator, readings, rows)
     some = windows.of(np.arange(min(state.size, len(rows))))
     if state.asked == "trial":
-        return with_trial(some, state, rounding), Epoch({})
+        return with_trial(some, state, rounding), Epoch({"moved": state.moved})
     if state.asked == "size":
-        return with_random_forces(some, state, rounding), Epoch({})
+        return with_random_forces(some, state, rounding), Epoch({"moved": state.moved})
     rounds = 1 if state.wide else NOISE_ROUNDS
     found, _ = with_noise(windows, state.point, state.noise, rounding, count, rounds, random[2], state.force)
     state = replace(state, noise=found.noise)
