@@ -14,6 +14,7 @@ from madoc.calibration.least_squares.filtering import of_contacts
 from madoc.calibration.least_squares.instruments import Side, agreed, axes_of
 from madoc.calibration.least_squares.lengthening import LeastSquaresState, back_to_filter
 from madoc.calibration.least_squares.sentences import about_surprises
+from madoc.data import stride
 from madoc.identification import random_forces
 from madoc.identification.ensembles import (
     BEFORE,
@@ -252,6 +253,8 @@ def test_random_forces_are_asked_for_at_the_end_and_found(tmp_path):
     rest = replace(search, wide=3, quiet=1, together=filter_state.TOGETHER, squares=told, halved=9)
     state = back_to_filter(LeastSquaresState(None, (), "filtering", rest, None))
     assert state.filtered.asked == "trial" and not state.filtered.settled and not state.finished
+    exact = replace(state.filtered, asked="exact", cost=2.0)  # before a search from fitted starts has had its steps
+    assert not exact.settled and not exact.found.unlike_noise
     (tried, _), spent = counted(filtering.step, problem, state.filtered, "cauchy")
     assert tried.asked == "size" and spent == filtering.epoch_steps(problem, state.filtered)
     (found, _), spent = counted(filtering.step, problem, tried, "cauchy")
@@ -265,16 +268,16 @@ def test_random_forces_are_asked_for_at_the_end_and_found(tmp_path):
     known = replace(done, alike=0.0, explained_share=0.5)
     assert known.found.unlike_noise and known.found.force == 0.0 and replace(done, alike=0.0).found.force == found.force
     (warning,) = about_surprises(problem, known)
-    assert "state and action explain 50 % of the squares of one, as they do not of random forces" in warning
+    assert "they are not random: state and action explain 50 % of one of them" in warning
     (warning,) = about_surprises(problem, replace(known, force=0.0))
     assert "explain 50 % of what the model leaves of a signal" in warning
     without = problem_of_foot(tmp_path)
     trial = replace(state.filtered, size=12)
     (none, _), _ = counted(filtering.step, without, trial, "cauchy")
     assert none.force == 0.0 and none.settled and none.asked == "known"
-    doubtful = replace(trial, cost=2.0)
-    assert filtering.step(without, doubtful, "cauchy")[0].asked == "size"  # whatever the trial says
-    (none, _), _ = counted(filtering.step, without, replace(doubtful, asked="size"), "cauchy")
+    doubtful = back_to_filter(replace(state, filtered=replace(rest, cost=2.0, size=12))).filtered
+    assert doubtful.asked == "size"  # without a trial
+    (none, _), _ = counted(filtering.step, without, doubtful, "cauchy")
     assert none.force == 0.0 and none.asked == "known" and none.settled
 
 
@@ -293,3 +296,24 @@ def test_epochs_near_the_end_take_other_windows_and_count_together(tmp_path):
     far = replace(near, quiet=1, moved=filter_state.NEAR)
     fresh_start, _ = filtering.step(problem, far, "cauchy")
     assert fresh_start.together == 0 and not fresh_start.gradients[32:].any()
+
+
+def test_random_forces_are_likelier_only_beyond_two_standard_errors_of_enough_windows():
+    """By hand: changes of -1 ± 1 in sixteen windows have a mean of -1 and a standard error of 1.03 / 4."""
+    change = np.tile([0.0, -2.0], 8)
+    assert remainder.likelier(change, np.zeros(16), 2)
+    assert not remainder.likelier(change + 0.5, np.zeros(16), 2)  # -0.5 is less than twice 0.258
+    assert remainder.likelier(change + 0.45, np.zeros(16), 2)
+    assert not remainder.likelier(change, np.where(np.arange(16) < 12, np.nan, 0.0), 2)  # four windows do not tell
+    assert remainder.likelier(np.append(change, np.nan), np.zeros(17), 2)  # one that fails does not count
+
+
+def test_the_largest_random_force_makes_the_typical_change_of_the_speed(tmp_path):
+    """The foot's mass in the model is 1 kg; in 10 ms a force F changes its speed by F · 0.01 s / 1 kg."""
+    problem = problem_of_foot(tmp_path, rows=300)
+    steps = stride(problem.dataset)
+    log, speeds = problem.dataset, problem.states.states[:, 2:4]
+    runs = [speeds[first:end] for first, end in zip(log.episode_starts, log.episode_ends, strict=True)]
+    changes = np.abs(np.concatenate([each[steps:] - each[:-steps] for each in runs])).mean(0)
+    size = random_forces.largest(problem.dataset, problem.states, problem.simulator)
+    assert size == pytest.approx(changes.max() / 0.01 / np.sqrt(steps))

@@ -10,9 +10,10 @@ from known_errors import known
 from madoc import simulation
 from madoc.calibration import CalibrationProblem
 from madoc.data import Disturbance, disturb
+from madoc.data.velocities import dof_names
 from madoc.identification.ensembles import few_of, members_at
 from madoc.identification.innovations import FARTHEST, Correction, innovations
-from madoc.identification.random_forces import by_dof, names_of, opposed
+from madoc.identification.random_forces import by_dof, opposed
 from madoc.identification.replay import Readings
 from robots import SPRING_TRUTH, recorded, spring
 
@@ -73,17 +74,19 @@ def test_errors_that_state_and_action_explain_are_not_noise():
     errors[..., 2] = 0.0
     found = replace(known(errors), before=random.standard_normal((40, 15, 2)))
     assert found.explained_by(actions, every) < 0.03
+    errors = errors.copy()
     errors[0, ..., 1] += actions[..., 0]
-    driven = replace(found, mean=errors)
+    driven = replace(found, mean=errors.copy())
     assert driven.explained_by(actions, every) == pytest.approx(0.5, abs=0.07)
     assert driven.explained_by(actions, np.arange(40) < 13) == 0.0  # 195 readings do not tell
     errors[0, ..., 1] += np.sign(found.before[..., 0]) - actions[..., 0]
     assert replace(found, mean=errors).explained_by(actions, every) > 0.3
     forces = np.stack([random.standard_normal((40, 15)), 3.0 * actions[..., 0] + random.standard_normal((40, 15))], -1)
     assert replace(found, pushed=1e-3 * forces).explained_by(actions, every) == pytest.approx(0.9, abs=0.03)
+    assert replace(found, pushed=forces[..., :1]).explained_by(actions, every) < 0.03
     assert (
-        replace(found, pushed=forces[..., :1]).explained_by(actions, every) < 0.03
-    )  # where forces act, these are asked
+        replace(found, mean=errors, pushed=forces[..., :1]).explained_by(actions, every) > 0.3
+    )  # errors count as well
 
 
 def test_what_readings_tell_of_random_forces_is_their_mean_given_these():
@@ -108,7 +111,7 @@ def test_what_readings_tell_of_random_forces_is_their_mean_given_these():
     exact = ((after - alone) / (pushed - alone))[0, :, 1]
     np.testing.assert_allclose(told[:, 0], exact, atol=1e-3)
     assert by_dof(simulator, 0.3) == pytest.approx(0.3 * np.sqrt(task.model.dof_M0)) and not len(by_dof(simulator, 0.0))
-    assert names_of(simulator) == ["slide"]
+    assert dof_names(task) == ["slide"]
 
 
 def test_predictions_leave_errors_alike_only_where_windows_agree():

@@ -147,6 +147,10 @@ def test_a_certain_term_of_a_thousandth_is_never_calibrated_unless_a_finer_step_
     for other in (replace(least, t=4.9), replace(least, explained=9e-4)):
         assert judge(replace(PREDICTED, missing_terms=(other,))).word == "CALIBRATED"
     assert judge(replace(PREDICTED, missing_terms=(least,), finer=True)).word == "CALIBRATED"
+    step = term(INTEGRATION, t=3.0, explained=0.02, parameter="")  # a quarter of it leaves at most a fifth, 0.004
+    for share, word in ((0.0041, "NOT_IDENTIFIABLE"), (0.0039, "CALIBRATED")):
+        finer = replace(PREDICTED, missing_terms=(step, replace(least, explained=share)), finer=True)
+        assert judge(finer).word == word
 
 
 def test_what_is_usual_is_named_before_a_tilted_base():

@@ -131,7 +131,8 @@ class Estimate:
             does not estimate the noise.
         effective: Whether the model leaves more than noise, and the estimate is the one that predicts best with it.
         random_forces: Standard deviation of random forces on each degree of freedom of the model, in its order, in N or
-            N·m, new ones in each control step, that act on the machine besides; empty where none were found.
+            N·m, new ones in each control step, that act on the machine besides; empty where none were found
+            that are random.
         group_stability: Mean adjusted Rand index of the groups with those found from resampled states, or proposed in
             other epochs; 1 is the same groups, 0 chance. None where groups were not found from the problem.
     """

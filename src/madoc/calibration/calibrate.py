@@ -9,9 +9,9 @@ from jaxtyping import Float, PRNGKeyArray
 from madoc.calibration.base import CalibrationProblem, Calibrator, EmbedsParameters, Estimate
 from madoc.calibration.registry import CALIBRATORS
 from madoc.calibration.result import CalibrationResult, ParameterEstimate
+from madoc.data.velocities import dof_names
 from madoc.evaluation import calibration_error
 from madoc.identification.combinations import combinations
-from madoc.identification.random_forces import names_of
 from madoc.parameters import Parameter, ParameterSpace
 from madoc.runs import loop
 from madoc.runs.budget import Budget
@@ -95,7 +95,7 @@ def calibrate(
         settled=estimate.settled,
         unlike_noise=estimate.unlike_noise,
         effective=estimate.effective,
-        random_forces=dict(zip(names_of(problem.simulator), estimate.random_forces.tolist(), strict=False)),
+        random_forces=_named(problem.simulator.task, estimate.random_forces),
         group_stability=estimate.group_stability,
         problem=problem,
     )
@@ -106,6 +106,11 @@ def calibrate(
                 np.savez(stream, allow_pickle=False, names=np.array(space.names), vectors=vectors)
         folder.write_json("result.json", result.to_json())
     return result
+
+
+def _named(task: Task, forces: Float[np.ndarray, " dof"]) -> dict[str, float]:
+    """Forces by the names of their degrees of freedom; empty where there are none."""
+    return dict(zip(dof_names(task), forces.tolist(), strict=True)) if len(forces) else {}
 
 
 def _trace(space: ParameterSpace, estimate: Estimate) -> dict[str, float]:

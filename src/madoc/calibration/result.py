@@ -75,7 +75,7 @@ class CalibrationResult:
             and action.
         effective: Whether the model leaves more than noise, and the estimate is the one that predicts best with it.
         random_forces: Standard deviation of random forces by degree of freedom, in N or N·m, new ones in each control
-            step, that act on the machine besides what the model has; empty where none were found.
+            step, that act on the machine besides what the model has; empty where none were found that are random.
         group_stability: How alike groups of resampled states are: their mean adjusted Rand index, 1 for the same
             groups, 0 for chance; None where the method did not find groups.
         chosen: Why `auto` took this method, in a sentence; None where the method was named.

@@ -47,14 +47,18 @@ def moving_states(
 
 def velocity_names(task: Task, addresses: Int[np.ndarray, " values"]) -> tuple[str, ...]:
     """Names of indices in (qpos, qvel) as in a spec: velocity(JOINT), or velocity(JOINT)[2] where it has several."""
-    model = task.compile()
-    names = []
-    for dof in np.asarray(addresses) - model.nq:
-        joint = model.dof_jntid[dof]
-        same_joint = np.flatnonzero(model.dof_jntid == joint)
-        part = f"[{dof - same_joint[0]}]" if len(same_joint) > 1 else ""
-        names.append(f"velocity({model.joint(joint).name or joint}){part}")
-    return tuple(names)
+    names = [name.partition("[") for name in dof_names(task)]
+    every = [f"velocity({joint}){bracket}{part}" for joint, bracket, part in names]
+    return tuple(every[dof] for dof in np.asarray(addresses) - task.model.nq)
+
+
+def dof_names(task: Task) -> list[str]:
+    """Names of degrees of freedom: JOINT, or JOINT[2] where it has several; a joint without a name by its number."""
+    model = task.model
+    counts, first = np.bincount(model.dof_jntid), model.jnt_dofadr[model.dof_jntid]
+    names = [model.joint(joint).name or str(joint) for joint in model.dof_jntid]
+    several = counts[model.dof_jntid] > 1
+    return [f"{name}[{dof - first[dof]}]" if several[dof] else name for dof, name in enumerate(names)]
 
 
 def show_velocities(task: Task) -> Task:

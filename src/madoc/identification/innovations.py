@@ -155,20 +155,21 @@ class Innovations:
         """The largest share of a channel's whitened errors, or of a random force, that state and action explain.
 
         It is that of the first system in the windows kept, outliers clipped; 0 for right predictions, whose errors
-        depend on nothing that was known before, and where windows are too few to tell. Where random forces act, what
-        readings tell of them is asked, not errors of all noise.
+        depend on nothing that was known before, and where windows are too few to tell. Of random forces it is what
+        readings tell of them: errors are of all noise, which hides a force.
         """
         kept, first = kept & self.whole[0], self.first
+        errors = np.clip(self.whitened[0], -CLIP, CLIP)
+        values = np.concatenate([errors, self.pushed], axis=-1)[kept, first:]
         inputs = np.concatenate([self.before, actions], axis=-1)[kept, first:]
-        values = (self.pushed if self.pushed.size else np.clip(self.whitened[0], -CLIP, CLIP))[kept, first:]
         rows = inputs.shape[0] * inputs.shape[1]
         if rows < FEWEST_EXPLAINED:
             return 0.0
         columns = values.reshape(rows, values.shape[-1])
         columns = columns[:, columns.std(0) > 0.0]
+        columns = np.clip(columns / columns.std(0), -CLIP, CLIP)
         folds = folds_of(np.repeat(np.arange(len(inputs)), inputs.shape[1]))
-        shares = explained_each(inputs.reshape(rows, -1), columns / columns.std(0), folds)
-        return float(shares.max(initial=0.0))
+        return float(explained_each(inputs.reshape(rows, -1), columns, folds).max(initial=0.0))
 
     def noise_ratio(self) -> Float[np.ndarray, " channels"]:
         """Mean square of each channel's prediction errors over their variance, outliers clipped; 1 if they are all 0.

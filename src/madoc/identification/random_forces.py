@@ -10,24 +10,14 @@ import numpy as np
 from jaxtyping import Float
 
 from madoc.data.dataset import Dataset
+from madoc.data.timescale import stride
 from madoc.identification.states import LoggedStates
-from madoc.identification.windows import consecutive_rows
 from madoc.simulation.base import Simulator
 
 
 def by_dof(simulator: Simulator, size: float) -> Float[np.ndarray, " dof"]:
     """Standard deviations of forces of size s, in N/√kg, on each degree of freedom, in N or N·m; empty where s is 0."""
     return np.asarray(size * np.sqrt(simulator.task.model.dof_M0)) if size else np.zeros(0)
-
-
-def names_of(simulator: Simulator) -> list[str]:
-    """Names of the degrees of freedom: that of the joint, with a number behind it where it has several."""
-    model = simulator.task.model
-    joints = [model.joint(joint).name or f"joint {joint}" for joint in model.dof_jntid]
-    return [
-        f"{joint}[{dof - model.jnt_dofadr[number]}]" if joints.count(joint) > 1 else joint
-        for dof, (joint, number) in enumerate(zip(joints, model.dof_jntid, strict=True))
-    ]
 
 
 def forces(
@@ -46,8 +36,14 @@ def opposed(
 
 
 def largest(dataset: Dataset, logged: LoggedStates, simulator: Simulator) -> float:
-    """The size s in N/√kg of forces that alone would make typical changes of speeds; the largest of those of each."""
-    follows = consecutive_rows(dataset, logged.rows)
+    """The size s in N/√kg of forces that alone would make typical changes of speeds; the largest of those of each.
+
+    Changes are over a stride, in which more than noise moves; the speed that forces make grows with the root of it.
+    """
+    steps, rows = stride(dataset), logged.rows
+    ends = dataset.episode_ends[dataset.episode_of(rows)]
+    first = np.flatnonzero(rows[:-steps] + steps == rows[steps:])
+    first = first[rows[first] + steps < ends[first]]
     speeds = logged.states[:, simulator.task.model.nq : logged.physical_size]
-    changes = np.abs(speeds[follows + 1] - speeds[follows]).mean(0) if len(follows) else np.zeros(speeds.shape[1])
-    return float((np.sqrt(simulator.task.model.dof_M0) * changes).max() / simulator.control_step)
+    changes = np.abs(speeds[first + steps] - speeds[first]).mean(0) if len(first) else np.zeros(speeds.shape[1])
+    return float((np.sqrt(simulator.task.model.dof_M0) * changes).max() / (np.sqrt(steps) * simulator.control_step))

@@ -82,7 +82,7 @@ def explained_each(
 
 
 def folds_of(groups: Int[np.ndarray, " rows"]) -> Folds:
-    """Fifths of the groups, in rows: none is predicted from rows of its own group. None where there are too few."""
+    """Fifths of the groups, in rows: none is predicted from rows of its own group. Empty where groups are too few."""
     count = len(np.unique(groups))
     return list(GroupKFold(FOLDS).split(groups, groups=groups)) if count >= _FEWEST else []
 

@@ -84,6 +84,17 @@ def worth_naming(removed: MissingTerm | None = None) -> float:
     return WORTH_NAMING if removed is None else max(WORTH_NAMING, NOT_REMOVED * removed.explained)
 
 
+def may_be_left(holdout: HoldOut) -> float:
+    """Share of the squared residuals below which a finer timestep may leave a term of the numerical error.
+
+    It is 0 where terms were tested with the model's own timestep.
+    """
+    if not holdout.finer:
+        return 0.0
+    removed = integration(holdout.missing_terms)
+    return np.inf if removed is None else NOT_REMOVED * removed.explained
+
+
 def of_small_terms(terms: Sequence[MissingTerm], least: float = WORTH_NAMING) -> tuple[Alternative, ...]:
     """The estimate with each term that is certain and explains less than a share `least`, for intervals to cover."""
     small = [term for term in terms if is_certain(term) and _is_small(term, least)]

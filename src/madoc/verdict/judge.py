@@ -14,7 +14,7 @@ from madoc.identification.combinations import Combination
 from madoc.identification.information import OPEN
 from madoc.identification.missing_terms import OTHER_WINDOWS
 from madoc.identification.term_tests import named
-from madoc.verdict.adequacy import is_certain, numerical
+from madoc.verdict.adequacy import is_certain, may_be_left, numerical
 from madoc.verdict.mismatch import (
     BEYOND_RANDOM,
     SEPARABLE,
@@ -222,10 +222,11 @@ def _small_but_certain(holdout: HoldOut) -> Verdict | None:
     """What is certainly missing, though it explains too little of the residuals to be named as the cause.
 
     Parameters may have made up for more of it than is left. With a finer timestep a certain term may be what is left of
-    the numerical error, and intervals cover it.
+    the numerical error (`may_be_left`), and intervals cover it.
     """
-    small = [term for term in holdout.missing_terms if is_certain(term) and term.explained >= LEAST_EXPLAINED]
-    if not small or holdout.finer or numerical(holdout) is not None:
+    least = max(LEAST_EXPLAINED, may_be_left(holdout))
+    small = [term for term in holdout.missing_terms if is_certain(term) and term.explained >= least]
+    if not small or numerical(holdout) is not None:
         return None
     clearest = max(small, key=lambda term: abs(term.t))
     return _not_certain(

@@ -245,12 +245,11 @@ def _imitated(
     pushes = random_forces.forces(forces, (IMITATED, len(windows), readings.steps), np.random.default_rng(1))
     begun = np.repeat(states[None], IMITATED, axis=0)
     made = replays.residuals_from(drawn, begun, pushes)[windows % IMITATED, windows]
-    left = residuals[:, : replays.fitted + 1]
+    left = residuals[np.isfinite(residuals).all((1, 2)), : replays.fitted + 1]
     noise = residual_noise(left, made.shape[-1])
-    if (
-        forces.any()
-    ):  # what they did to the fitted readings lasts; noise alone is in the differences of consecutive ones
-        noise = np.minimum(noise, np.sqrt(np.nanmean(np.diff(left, axis=1) ** 2, axis=(0, 1)) / 2.0))
+    if forces.any() and len(left):
+        # What forces did to the fitted readings lasts; noise alone is in the differences of consecutive ones.
+        noise = np.minimum(noise, np.sqrt((np.diff(left, axis=1) ** 2).mean((0, 1)) / 2.0))
     made = np.where(np.isfinite(made), made, 0.0) + noise * random.standard_normal(made.shape)
     observed = moved(bench.simulator.task.attitudes, readings.observed, made * readings.scale)
     return replace(replays, readings=replace(readings, observed=observed)).residuals(point[None])

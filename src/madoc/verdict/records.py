@@ -68,10 +68,10 @@ def _doubts(
     """What the log says against the model, and whether that was tested with a finer integration step.
 
     Where the error of the integration step explains much, or as much as any certain term, it may hide others or look
-    like one. These are then
-    tested with steps of a quarter of the length, unless their error explains much there too. A log that tells neither
-    states nor what is needed to fit them cannot be tested, nor can one without pairs of consecutive observations. Under
-    a limit of time windows are as many as that allows. With `shorter` they are so many times as short and as many.
+    like one. These are then tested with steps of a quarter of the length, unless their error explains much there too. A
+    log that tells neither states nor what is needed to fit them cannot be tested, nor can one without pairs of
+    consecutive observations. Under a limit of time windows are as many as that allows. With `shorter` they are so many
+    times as short and as many.
     """
     problem, task = bench.problem, bench.problem.simulator.task
     ordered = bool((problem.dataset.episode_ends - problem.dataset.episode_starts > 1).any())

@@ -56,8 +56,9 @@ class FilterState:
         epochs: Number of epochs.
         failures: Number of windows whose simulation failed.
         force: Size of random forces in N/√kg (`random_forces`), 0 until these are looked for.
-        asked: What is asked of random forces: `nothing` until the search has settled, in the next step by a `trial`
-            whether any act, then of which `size` they are, and nothing after that, when it is `known`.
+        asked: What is asked once the search has settled, and `nothing` before: whether a search from fitted starts
+            leads to `exact` values, by a `trial` whether random forces act, of what `size` they are, and nothing more
+            when that is `known`.
         explained_share: Share in [0, 1] of prediction errors, or of random forces, that state and action explain
             (`Innovations.explained_by`); 0 until the end.
     """
@@ -87,7 +88,7 @@ class FilterState:
     epochs: int = 0
     failures: int = 0
     force: float = 0.0
-    asked: Literal["nothing", "trial", "size", "known"] = "nothing"
+    asked: Literal["nothing", "exact", "trial", "size", "known"] = "nothing"
     explained_share: float = 0.0
 
     @property

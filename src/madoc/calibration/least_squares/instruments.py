@@ -5,7 +5,8 @@ part of a standard error, and there a derivative does not tell where the minimum
 and differences over points as far apart as parameters are uncertain (statistical linearisation, Gelb 1974, 6.2).
 
 A finite ensemble leaves chance in them, by which a least-squares step would be biased and too short, as both share it.
-So there are two independent ensembles a and b, whose derivatives are instruments for the other (Reiersol 1941):
+So there are two ensembles a and b, drawn independently, and the derivatives of each are instruments for the other
+(Reiersol 1941):
 
     (Jaᵀ W Jb + Jbᵀ W Ja) p = -(Jbᵀ ψ(ra) + Jaᵀ ψ(rb)),
 

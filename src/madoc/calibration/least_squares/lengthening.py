@@ -227,7 +227,7 @@ def after_filter(problem: CalibrationProblem, state: LeastSquaresState, horizon:
         return back_to_filter(state)
     found = settled_to_noise(problem.simulator, readings, point, likely)
     first = replace(first, point=point[None].copy(), states=found.states[None], refining=1)
-    return replace(state, unknown=(first,), stage="estimated")
+    return replace(state, unknown=(first,), stage="estimated", filtered=replace(filtered, asked="exact"))
 
 
 def leaves_much_less(search: SearchState, filtered: FilterState) -> bool:
@@ -246,7 +246,8 @@ def back_to_filter(state: LeastSquaresState) -> LeastSquaresState:
     assert state.filtered is not None
     if state.filtered.asked == "known":
         return replace(state, stage="filtering", finished=1)
-    return replace(state, stage="filtering", filtered=replace(state.filtered, asked="trial"))
+    asked: Literal["size", "trial"] = "size" if state.filtered.unlike_noise else "trial"
+    return replace(state, stage="filtering", filtered=replace(state.filtered, asked=asked))
 
 
 def failed(state: LeastSquaresState) -> LeastSquaresState:

@@ -40,12 +40,13 @@ def with_what_is_left(
     """
     found, noise = with_noise(windows, state.point, state.noise, rounding, LARGE, LARGE_ROUNDS, random, state.force)
     costs = surprises(found, loss)
-    if (lost := np.flatnonzero(costs > LONG_TAILS)).size:
+    followed = costs <= LONG_TAILS
+    if (lost := np.flatnonzero(~followed)).size:
         # An ensemble may lose what it follows by chance. What the model lacks surprises a larger one as well.
         again, count = windows.of(lost), LARGER * LARGE
         larger, _ = with_noise(again, state.point, found.noise, rounding, count, 1, random, state.force)
         costs[lost] = np.minimum(costs[lost], surprises(larger, loss))
-    share = found.explained_by(windows.readings.actions, costs <= LONG_TAILS)
+    share = found.explained_by(windows.readings.actions, followed)
     return replace(state, noise=noise, cost=over_windows(costs), alike=found.alike(), explained_share=share)
 
 
@@ -55,9 +56,9 @@ def trial_steps(windows: int, horizon: int) -> int:
 
 
 def with_trial(windows: FilteredWindows, state: FilterState, rounding: Float[np.ndarray, " channels"]) -> FilterState:
-    """The state at its end; or with random forces asked for, as some make it likelier or errors are unlike noise."""
+    """The state at its end, or with the size of random forces asked for, where some make readings likelier."""
     none, some = (_tried(windows, state, rounding, power) for power in (-np.inf, TRIAL))
-    pushed = state.unlike_noise or _likelier(some.misfit(), none.misfit(), len(state.point))
+    pushed = likelier(some.misfit(), none.misfit(), len(state.point))
     return replace(state, asked="size" if pushed else "known", epochs=state.epochs + 1)
 
 
@@ -71,21 +72,26 @@ def with_random_forces(
 ) -> FilterState:
     """The state with random forces of the size that makes readings likeliest, and its search to go on with them.
 
-    Where none make them certainly likelier the search is at its end as it was. Every size is tried on the same members,
-    and judged by the windows in which no simulation failed with any.
+    Where none make them certainly likelier the search is at its end as it was. Every size is tried on the same members;
+    one that makes a simulation fail which does not without forces is too large.
     """
     tried = {-np.inf: _tried(windows, state, rounding, -np.inf)}
+    misfits = {-np.inf: tried[-np.inf].misfit()}
+    whole, done = np.isfinite(misfits[-np.inf]), replace(state, asked="known", epochs=state.epochs + 1)
+    if not whole.any():
+        return done
 
     def misfit(power: float) -> float:
         tried[power] = _tried(windows, state, rounding, power)
-        each = tried[power].misfit()
-        return float(each[np.isfinite(each)].mean()) if np.isfinite(each).any() else np.inf
+        misfits[power] = tried[power].misfit()
+        return float(np.where(np.isfinite(misfits[power][whole]), misfits[power][whole], np.inf).mean())
 
     minimize_scalar(misfit, bounds=(SMALLEST_SIZE, 0.0), method="bounded", options={"maxiter": SIZES})
-    misfits = {power: each.misfit() for power, each in tried.items()}
-    whole, done = np.isfinite([*misfits.values()]).all(0), replace(state, asked="known", epochs=state.epochs + 1)
-    best = min(misfits, key=lambda power: float(misfits[power][whole].sum()))
-    if not _likelier(misfits[best][whole], misfits[-np.inf][whole], len(state.point)):
+    best = min(
+        misfits,
+        key=lambda power: float(misfits[power][whole].mean()) if np.isfinite(misfits[power][whole]).all() else np.inf,
+    )
+    if not likelier(misfits[best], misfits[-np.inf], len(state.point)):
         return done
     return replace(
         done,
@@ -117,7 +123,7 @@ def _size(windows: FilteredWindows, power: float) -> float:
     return float(largest(windows.dataset, windows.logged, windows.simulator) * 10.0**power)
 
 
-def _likelier(misfits: Float[np.ndarray, " windows"], without: Float[np.ndarray, " windows"], parameters: int) -> bool:
+def likelier(misfits: Float[np.ndarray, " windows"], without: Float[np.ndarray, " windows"], parameters: int) -> bool:
     """Whether random forces certainly make windows' readings likelier; not where too few are whole to tell."""
     change = misfits - without
     change = change[np.isfinite(change)]

@@ -8,8 +8,9 @@ from madoc.calibration.least_squares.filter_state import FilterState
 from madoc.calibration.least_squares.search import SearchState
 from madoc.calibration.least_squares.statistics import EXACT, LONG_TAILS
 from madoc.data import stride
+from madoc.data.velocities import dof_names
 from madoc.identification.noise import WHITE
-from madoc.identification.random_forces import by_dof, names_of
+from madoc.identification.random_forces import by_dof
 from madoc.identification.systematic import EXPLAINED
 
 MOST_LEFT_OUT = 0.05
@@ -22,13 +23,12 @@ ALIKE = (
     "noise is not: the intervals are too narrow, by how much is not known"
 )
 PREDICTABLE = (
-    "state and action explain {:.0f} % of what the model leaves of a signal, as they do not of noise: the model lacks "
-    "something, and the intervals are too narrow, by how much is not known"
+    "state and action explain {:.0f} % of what the model leaves of a signal, as they do not explain noise: the model "
+    "lacks something, and the intervals are too narrow, by how much is not known"
 )
 NOT_RANDOM = (
-    "forces act on the machine that the model does not have, and state and action explain {:.0f} % of the squares of "
-    "one, as they do not of random forces: the model lacks something, and the intervals are too narrow, by how much is "
-    "not known"
+    "forces act on the machine that the model does not have, and they are not random: state and action explain {:.0f} "
+    "% of one of them; the model lacks something, and the intervals are too narrow, by how much is not known"
 )
 PUSHED = (
     "random forces that the model does not have act on the machine: in each control step new ones, of which that on {} "
@@ -89,7 +89,7 @@ def about_surprises(problem: CalibrationProblem, search: FilterState) -> tuple[s
     forces = by_dof(problem.simulator, search.found.force)
     if len(forces):
         largest = int(forces.argmax())
-        about.append(PUSHED.format(names_of(problem.simulator)[largest], forces[largest]))
+        about.append(PUSHED.format(dof_names(problem.simulator.task)[largest], forces[largest]))
     return tuple(about)
 
 
