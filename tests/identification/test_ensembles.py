@@ -65,6 +65,7 @@ def test_readings_are_as_likely_as_their_errors_and_what_was_expected_of_them():
     errors[0, :, 0, 0] = 2.0, 9.0  # the second channel's are all 0, and do not count
     found = replace(known(errors), noise=np.array([0.5, 7.0]))
     np.testing.assert_allclose(found.misfit(), np.log(0.5) + np.array([2.0, 4.5]))
+    assert np.isnan(replace(found, mean=0.0 * errors, whole=np.zeros((1, 2), bool)).misfit()).all()
 
 
 def test_errors_that_state_and_action_explain_are_not_noise():

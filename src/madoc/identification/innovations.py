@@ -123,6 +123,8 @@ class Innovations:
 
         Outliers are clipped, and channels do not count whose errors are all 0.
         """
+        if not self.whole[0].any():
+            return np.full(len(self.whole[0]), np.nan)
         deviations = np.diagonal(self.corrections.factor, axis1=-2, axis2=-1) * self.noise
         values = np.log(deviations) + np.minimum(self.whitened[0] ** 2, CLIP**2) / 2.0
         return np.where(self.whole[0], self.counted(values).mean(1), np.nan)

@@ -57,7 +57,8 @@ def trial_steps(windows: int, horizon: int) -> int:
 
 def with_trial(windows: FilteredWindows, state: FilterState, rounding: Float[np.ndarray, " channels"]) -> FilterState:
     """The state at its end, or with the size of random forces asked for, where some make readings likelier."""
-    none, some = (_tried(windows, state, rounding, power) for power in (-np.inf, TRIAL))
+    size = 10.0**TRIAL * largest(windows.dataset, windows.logged, windows.simulator)
+    none, some = (_tried(windows, state, rounding, each) for each in (0.0, size))
     pushed = likelier(some.misfit(), none.misfit(), len(state.point))
     return replace(state, asked="size" if pushed else "known", epochs=state.epochs + 1)
 
@@ -75,27 +76,28 @@ def with_random_forces(
     Where none make them certainly likelier the search is at its end as it was. Every size is tried on the same members;
     one that makes a simulation fail which does not without forces is too large.
     """
-    tried = {-np.inf: _tried(windows, state, rounding, -np.inf)}
-    misfits = {-np.inf: tried[-np.inf].misfit()}
-    whole, done = np.isfinite(misfits[-np.inf]), replace(state, asked="known", epochs=state.epochs + 1)
+    most, tried = largest(windows.dataset, windows.logged, windows.simulator), dict[float, Innovations]()
+    tried[0.0] = _tried(windows, state, rounding, 0.0)
+    without, done = tried[0.0].misfit(), replace(state, asked="known", epochs=state.epochs + 1)
+    whole = np.isfinite(without)
     if not whole.any():
         return done
+    costs = {0.0: float(without[whole].mean())}
 
-    def misfit(power: float) -> float:
-        tried[power] = _tried(windows, state, rounding, power)
-        misfits[power] = tried[power].misfit()
-        return float(np.where(np.isfinite(misfits[power][whole]), misfits[power][whole], np.inf).mean())
+    def cost(power: float) -> float:
+        size = float(most * 10.0**power)
+        tried[size] = _tried(windows, state, rounding, size)
+        each = tried[size].misfit()[whole]
+        costs[size] = float(each.mean()) if np.isfinite(each).all() else np.inf
+        return costs[size]
 
-    minimize_scalar(misfit, bounds=(SMALLEST_SIZE, 0.0), method="bounded", options={"maxiter": SIZES})
-    best = min(
-        misfits,
-        key=lambda power: float(misfits[power][whole].mean()) if np.isfinite(misfits[power][whole]).all() else np.inf,
-    )
-    if not likelier(misfits[best], misfits[-np.inf], len(state.point)):
+    minimize_scalar(cost, bounds=(SMALLEST_SIZE, 0.0), method="bounded", options={"maxiter": SIZES})
+    best = min(costs, key=costs.__getitem__)
+    if not likelier(tried[best].misfit(), without, len(state.point)):
         return done
     return replace(
         done,
-        force=_size(windows, best),
+        force=best,
         noise=tried[best].noise,
         apart=np.zeros_like(state.apart),
         chance=np.zeros_like(state.chance),
@@ -111,16 +113,11 @@ def with_random_forces(
 
 
 def _tried(
-    windows: FilteredWindows, state: FilterState, rounding: Float[np.ndarray, " channels"], power: float
+    windows: FilteredWindows, state: FilterState, rounding: Float[np.ndarray, " channels"], size: float
 ) -> Innovations:
-    """Prediction errors with random forces of a size, a power of ten in the largest one, and noise as it then is."""
-    random, force = np.random.default_rng([state.seed, state.epochs]), _size(windows, power)
-    return with_noise(windows, state.point, state.noise, rounding, MEMBERS, SIZE_ROUNDS, random, force)[0]
-
-
-def _size(windows: FilteredWindows, power: float) -> float:
-    """The size in N/√kg."""
-    return float(largest(windows.dataset, windows.logged, windows.simulator) * 10.0**power)
+    """Prediction errors with random forces of a size in N/√kg, and with noise as it then is."""
+    random = np.random.default_rng([state.seed, state.epochs])
+    return with_noise(windows, state.point, state.noise, rounding, MEMBERS, SIZE_ROUNDS, random, size)[0]
 
 
 def likelier(misfits: Float[np.ndarray, " windows"], without: Float[np.ndarray, " windows"], parameters: int) -> bool:
