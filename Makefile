@@ -11,7 +11,7 @@ WORKERS := -n auto --maxprocesses 4  # one for each core, 4 at most
 MUJOCO := mujoco==3.8.0 mujoco-core==4.0.1
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
-.PHONY: demo test test-slow test-versions wheel check types style layers figures docs lock clean
+.PHONY: demo test test-slow test-versions test-exports wheel check types style layers figures docs lock clean
 
 DEMO := examples/reach
 demo: $(RUNS)  ## the main job on an arm with an unknown load: logs, calibration, policies, evaluation; SEED=1 is another
@@ -41,6 +41,13 @@ test-versions: $(TESTS)  ## every test that takes seconds, with the oldest and t
 	  test -d $$folder/mujoco || $(PIP) install --no-deps --target $$folder $$one; \
 	  echo "$$one:"; PYTHONPATH=$$folder$${PYTHONPATH:+:$$PYTHONPATH} $(BIN)/python -m pytest $(WORKERS) --dist worksteal -rs; \
 	done
+
+STACKS := $(VENV)/stacks
+test-exports: $(TESTS)  ## the tests of exports beside the libraries they are for, installed in an environment of their own
+	test -x $(STACKS)/bin/python || $(PYTHON) -m venv $(STACKS)
+	$(STACKS)/bin/python -m pip --disable-pip-version-check --quiet install mjlab==1.6.0 mujoco-mjx playground==0.2.0 \
+	  --editable .[dev,view]
+	$(STACKS)/bin/python -m pytest -rs tests/export
 
 WHEEL := $(VENV)/wheel
 wheel: $(TESTS)  ## the package as others get it: built, installed in an empty environment, and an arm calibrated with it

@@ -90,6 +90,32 @@ def test_mjlab_gets_servos_of_equal_numbers_together_and_other_actuators_as_they
     assert "a delay of 4 physics steps is 0.5 ms more than estimated" in text and "density" in text
 
 
+def test_mjlab_gets_actuators_by_their_command_and_what_they_act_on_and_a_floating_base_where_it_is(tmp_path):
+    path, motor = tmp_path / "mjlab_robot.py", ROBOT.actuators[2]
+    others = (
+        replace(motor, name="turn", joint="drum", means="velocity"),
+        replace(motor, name="pull", joint="", tendon="rope"),
+        replace(motor, name="thrust", joint="", site="rotor.1"),
+        replace(motor, name="glue", joint=""),
+    )
+    robot = replace(ROBOT, actuators=(motor, *others), base=((0.0, 0.0, 0.3), (1.0, 0.0, 0.0, 0.0)), delay=0.0)
+    save_mjlab(path, robot, PARAMETERS)
+    text = path.read_text().replace("TransmissionType.TENDON", "'tendon'").replace("TransmissionType.SITE", "'site'")
+    (tmp_path / "literal.py").write_text(text)
+    found = calls(tmp_path / "literal.py", "XmlActuatorCfg")
+    assert [(each["target_names_expr"], each["command_field"], each.get("transmission_type")) for each in found] == [
+        (("hip",), "effort", None),
+        (("drum",), "velocity", None),
+        (("rope",), "effort", "tendon"),
+        (("rotor\\.1",), "effort", "site"),
+    ]
+    assert "glue drives no hinge" in text and "import TransmissionType" in text
+    assert "pos=(0.0, 0.0, 0.3)" in text and "rot=(1.0, 0.0, 0.0, 0.0)" in text
+    save_mjlab(path, replace(ROBOT, actuators=()), PARAMETERS)
+    assert "import \n" not in path.read_text() and "ACTUATORS = (\n)" in path.read_text()
+    ast.parse(path.read_text())
+
+
 def test_isaac_lab_gets_what_its_joints_have_and_is_told_the_rest(tmp_path):
     path = tmp_path / "isaac_lab_robot.py"
     save_isaac_lab(path, ROBOT, PARAMETERS)
@@ -131,10 +157,7 @@ def test_isaac_lab_is_asked_for_by_its_published_names_alone(tmp_path, delay):
 def test_rows_of_the_model_are_found_again_in_a_scene_with_other_bodies_and_a_floor(tmp_path):
     path = tmp_path / "mjlab_robot.py"
     save_mjlab(path, ROBOT, PARAMETERS)
-    tree = ast.parse(path.read_text())
-    (function,) = (node for node in tree.body if getattr(node, "name", "") == "rows_in_scene")
-    names = {"np": np, "MADE_BY_MJLAB": ("servo",)}
-    exec(compile(ast.Module([function], []), str(path), "exec"), names)
+    rows = rows_in_scene(path, ("servo",))
     legs = """<mujoco><worldbody><geom name="own floor" type="plane" size="1 1 1"/><body><freejoint/><geom size="0.1"/>
     <body name="leg"><joint name="hip"/><geom size="0.1"/></body></body></worldbody>
     <actuator><motor name="push" joint="hip"/><position name="servo" joint="hip"/></actuator></mujoco>"""
@@ -147,7 +170,7 @@ def test_rows_of_the_model_are_found_again_in_a_scene_with_other_bodies_and_a_fl
     spec.attach(robot, prefix="robot/", frame=spec.worldbody.add_frame())
     scene = spec.compile()
     found = {
-        field: names["rows_in_scene"](field, alone, scene, "robot").tolist()
+        field: rows(field, alone, scene, "robot").tolist()
         for field in (
             "body_mass",
             "dof_armature",
@@ -160,8 +183,33 @@ def test_rows_of_the_model_are_found_again_in_a_scene_with_other_bodies_and_a_fl
     }
     assert found["body_mass"] == [-1, 2, 3] and found["dof_armature"] == [*range(1, 8)]
     assert found["jnt_stiffness"] == [1, 2] and found["qpos0"] == found["qpos_spring"] == [*range(1, 9)]
-    assert found["geom_friction"][0] == -1 and [scene.geom_bodyid[row] for row in found["geom_friction"][1:]] == [2, 3]
+    floor, *geoms = found["geom_friction"]
+    assert scene.geom(floor).name == "robot/own floor" and [scene.geom_bodyid[row] for row in geoms] == [2, 3]
     assert [scene.actuator(row).name for row in found["actuator_gear"]] == ["robot/push", "robot/hip"]
+
+
+def test_a_fixed_base_is_found_on_the_body_that_mjlab_puts_it_on(tmp_path):
+    path = tmp_path / "mjlab_robot.py"
+    save_mjlab(path, ROBOT, PARAMETERS)
+    arm = """<mujoco><worldbody><body name="upper"><joint name="shoulder"/><geom name="upper" size="0.1"/>
+    <body name="fore"><joint/><geom size="0.1"/></body></body></worldbody></mujoco>"""
+    spec = mujoco.MjSpec()
+    base = spec.worldbody.add_body(name="robot/mocap_base", mocap=True)
+    spec.attach(mujoco.MjSpec.from_string(arm), prefix="robot/", frame=base.add_frame())
+    alone, scene = mujoco.MjModel.from_xml_string(arm), spec.compile()
+    rows = rows_in_scene(path, set())
+    assert rows("body_mass", alone, scene, "robot").tolist() == [-1, 2, 3]
+    assert rows("dof_damping", alone, scene, "robot").tolist() == [0, 1]
+    assert rows("geom_size", alone, scene, "robot").tolist() == [0, 1]
+
+
+def rows_in_scene(path, made_by_mjlab):
+    """The function of that name in a file that imports mjlab."""
+    tree = ast.parse(path.read_text())
+    (function,) = (node for node in tree.body if getattr(node, "name", "") == "rows_in_scene")
+    names = {"np": np, "MADE_BY_MJLAB": made_by_mjlab}
+    exec(compile(ast.Module([function], []), str(path), "exec"), names)
+    return names["rows_in_scene"]
 
 
 @pytest.mark.parametrize("save", [save_mjlab, save_isaac_lab])

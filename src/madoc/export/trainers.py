@@ -37,6 +37,7 @@ class Robot:
         fields: Arrays of the model in which draws differ.
         lost: What MuJoCo's options say and mjlab's do not, a clause each.
         rounded: A clause with what it costs over held-out runs that the delay is a whole number of physics steps.
+        base: Position of a floating base at the start, m, and attitude, a unit quaternion; None of a fixed base.
     """
 
     name: str
@@ -49,6 +50,7 @@ class Robot:
     fields: Sequence[str]
     lost: Sequence[str]
     rounded: str = ""
+    base: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
 
 def save_mjlab(path: Path, robot: Robot, exported: Sequence[Exported]) -> None:
@@ -60,15 +62,18 @@ def save_mjlab(path: Path, robot: Robot, exported: Sequence[Exported]) -> None:
     lag, unsaid = _lag(robot)
     groups: dict[tuple[tuple[str, str], ...], list[str]] = {}
     for each in robot.actuators:
-        groups.setdefault(tuple(_of_mjlab(each).items()), []).append(each.joint or each.name)
+        if target := each.joint or each.tendon or each.site:
+            groups.setdefault(tuple(_of_mjlab(each).items()), []).append(target)
     delay = {"delay_min_lag": str(lag), "delay_max_lag": str(lag)} if lag else {}
     actuators = [
-        (kind, {"target_names_expr": _tuple(map(re.escape, joints)), **dict(arguments), **delay})
-        for ((_, kind), *arguments), joints in groups.items()
+        (kind, {"target_names_expr": _tuple(map(re.escape, targets)), **dict(arguments), **delay})
+        for ((_, kind), *arguments), targets in groups.items()
     ]
     placed = [field for field in robot.fields if field.partition("_")[0] in _PLACED]
     left = [field for field in robot.fields if field not in placed]
     unsaid += [f"draws do not reach {field}, which stays that of model.xml" for field in left]
+    untold = [each.name for each in robot.actuators if not (each.joint or each.tendon or each.site)]
+    unsaid += [f"{name} drives no hinge, slide, tendon or site, so no actuator here commands it" for name in untold]
     lost = [*robot.lost, *unsaid, *_around(exported, "dr.encoder_bias adds it to what is observed")]
     if any(each.servo for each in robot.actuators):
         lost.append("commands beyond their range in the spec are not cut off by BuiltinPositionActuatorCfg")
@@ -79,9 +84,11 @@ def save_mjlab(path: Path, robot: Robot, exported: Sequence[Exported]) -> None:
         version=MJLAB,
         lost=lost,
         imported=sorted({kind for kind, _ in actuators}),
+        transmissions=any("transmission_type" in arguments for _, arguments in actuators),
         actuators=actuators,
         servos=_tuple(each.name for each in robot.actuators if each.servo),
         start=_table(robot.start),
+        base=robot.base,
         physics=robot.physics,
         decimation=robot.decimation,
         fields=_tuple(placed),
@@ -141,7 +148,9 @@ _JOINT_WRITERS = {
 def _of_mjlab(actuator: JointActuator) -> dict[str, str]:
     """The kind and the arguments of an actuator's configuration, as source."""
     if not actuator.servo:
-        return {"kind": "XmlActuatorCfg"}
+        through = "tendon" if actuator.tendon else "site" if actuator.site else ""
+        transmission = {"transmission_type": f"TransmissionType.{through.upper()}"} if through else {}
+        return {"kind": "XmlActuatorCfg", "command_field": repr(actuator.means), **transmission}
     limit = {} if actuator.effort_limit is None else {"effort_limit": repr(actuator.effort_limit)}
     return {
         "kind": "BuiltinPositionActuatorCfg",

@@ -33,7 +33,15 @@ from madoc.pipeline.keys import stage_key
 from madoc.pipeline.orders import NO_PERMISSION, Permission
 from madoc.report.reading import read_arrays
 from madoc.simulation import Simulator
-from madoc.simulation.configuration import JointDrive, joint_actuators, joint_drives, physics_options, start_position
+from madoc.simulation.configuration import (
+    JointDrive,
+    base_pose,
+    floating_beside,
+    joint_actuators,
+    joint_drives,
+    physics_options,
+    start_position,
+)
 from madoc.simulation.drawn import numbers_of_draws
 from madoc.simulation.mjcf import DRIVES, save_mjcf
 from madoc.simulation.user_data import needs_callbacks
@@ -162,10 +170,15 @@ def _robot(simulator: Simulator, values: Float[np.ndarray, " parameters"], field
     task, model = simulator.task, simulator.model(values)
     named = [channel.actuator for channel in task.actions] or element_names(model, "actuator")
     physics, lost = physics_options(model)
+    lost += [
+        f"{name} floats beside the robot, and an entity has one floating base: take it out of get_spec into its own"
+        for name in floating_beside(model)
+    ]
     return Robot(
         name=task.name,
         actuators=joint_actuators(model, list(dict.fromkeys(named))),
         start=start_position(model),
+        base=base_pose(model),
         physics=physics,
         decimation=task.frame_skip,
         timestep=simulator.control_step / task.frame_skip,

@@ -27,6 +27,9 @@ class JointActuator:
         armature: Of the joint, kg·m² or kg.
         friction: Coulomb friction of the joint, N·m or N.
         viscous: Viscous damping of the joint, N·m·s/rad or N·s/m.
+        means: What its command is: position, velocity or effort.
+        tendon: The tendon that it pulls, if it does.
+        site: The site at which it acts, if it does.
     """
 
     name: str
@@ -38,6 +41,9 @@ class JointActuator:
     armature: float
     friction: float
     viscous: float
+    means: str = "effort"
+    tendon: str = ""
+    site: str = ""
 
 
 @dataclass(frozen=True)
@@ -112,11 +118,16 @@ def joint_actuators(model: mujoco.MjModel, names: Sequence[str]) -> list[JointAc
 
 def _joint_actuator(model: mujoco.MjModel, index: int) -> JointActuator:
     name, joint = model.actuator(index).name, int(model.actuator_trnid[index, 0])
-    single = int(model.actuator_trntype[index]) in OF_A_JOINT and int(model.jnt_type[joint]) in ONE_DOF
-    if not single:
-        return JointActuator(name, "", False, 0.0, 0.0, None, 0.0, 0.0, 0.0)
+    through, means = int(model.actuator_trntype[index]), _means(model, index)
+    if through not in OF_A_JOINT or int(model.jnt_type[joint]) not in ONE_DOF:
+        tendon = model.tendon(joint).name if through == mujoco.mjtTrn.mjTRN_TENDON else ""
+        site = model.site(joint).name if through == mujoco.mjtTrn.mjTRN_SITE else ""
+        return JointActuator(name, "", False, 0.0, 0.0, None, 0.0, 0.0, 0.0, means, tendon, site)
     dof = int(model.jnt_dofadr[joint])
-    gain, (offset, position, velocity) = float(model.actuator_gainprm[index, 0]), model.actuator_biasprm[index, :3]
+    gain, (offset, position, velocity) = (
+        float(model.actuator_gainprm[index, 0]),
+        model.actuator_biasprm[index, :3].tolist(),
+    )
     servo = (
         has_gain(model, index)
         and int(model.actuator_biastype[index]) == int(mujoco.mjtBias.mjBIAS_AFFINE)
@@ -133,12 +144,23 @@ def _joint_actuator(model: mujoco.MjModel, index: int) -> JointActuator:
         joint=model.joint(joint).name,
         servo=servo and (limited or not model.actuator_forcelimited[index]),
         stiffness=gain if servo else 0.0,
-        damping=float(-velocity) if servo else 0.0,
+        damping=-velocity if servo else 0.0,
         effort_limit=high if limited else None,
         armature=float(model.dof_armature[dof]),
         friction=float(model.dof_frictionloss[dof]),
         viscous=float(model.dof_damping[dof]),
+        means=means,
     )
+
+
+def _means(model: mujoco.MjModel, index: int) -> str:
+    """What an actuator's command is, by its bias: one of position makes it a position, else one of velocity that."""
+    if int(model.actuator_biastype[index]) != int(mujoco.mjtBias.mjBIAS_AFFINE):
+        return "effort"
+    _, position, velocity = model.actuator_biasprm[index, :3].tolist()
+    if int(model.actuator_dyntype[index]) == int(mujoco.mjtDyn.mjDYN_INTEGRATOR):  # of an intvelocity
+        return "velocity"
+    return "position" if position else "velocity" if velocity else "effort"
 
 
 def physics_options(model: mujoco.MjModel) -> tuple[dict[str, str], list[str]]:
@@ -176,6 +198,18 @@ def start_position(model: mujoco.MjModel) -> dict[str, float]:
     """Where the hinges and slides that have a name are in a model's reference pose, rad or m."""
     joints = [(model.joint(index).name, index) for index in range(model.njnt) if int(model.jnt_type[index]) in ONE_DOF]
     return {name: float(model.qpos0[model.jnt_qposadr[index]]) for name, index in joints if name}
+
+
+def base_pose(model: mujoco.MjModel) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
+    """Where a floating base is in the reference pose, m, and its attitude, a unit quaternion; None of a fixed base."""
+    floats = model.njnt > 0 and int(model.jnt_type[0]) == int(mujoco.mjtJoint.mjJNT_FREE)
+    return (tuple(model.qpos0[:3].tolist()), tuple(model.qpos0[3:7].tolist())) if floats else None
+
+
+def floating_beside(model: mujoco.MjModel) -> list[str]:
+    """Bodies that float freely besides the one of the model's first joint, by their names or else their numbers."""
+    others = model.jnt_bodyid[1:][model.jnt_type[1:] == mujoco.mjtJoint.mjJNT_FREE]
+    return [model.body(body).name or f"body {body}" for body in others]
 
 
 _INTEGRATORS = ("euler", "implicitfast")
