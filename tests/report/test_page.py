@@ -14,6 +14,7 @@ from madoc.report import write_comparison, write_report
 from madoc.report.page import headline, run_context
 from madoc.report.reading import read_run
 from madoc.report.sections import SECTIONS
+from madoc.report.words import TO_DO, TONES
 from madoc.runs.memory import write_peak
 
 IDS = list(SECTIONS)
@@ -140,7 +141,13 @@ def test_time_is_told_by_stage(whole):
 )
 def test_the_word_on_top_is_the_verdicts_or_how_it_ended(tmp_path, change, word, tone):
     top = headline(read_run(bare_folder(tmp_path / "run", **change)))
-    assert (top.word, top.tone) == (word, tone)
+    assert (top.word, top.tone) == (word, tone) and bool(top.to_do) == ("verdict" in change)
+
+
+@pytest.mark.parametrize("word", TONES)
+def test_every_verdict_says_on_top_of_its_page_what_to_do(tmp_path, word):
+    folder = bare_folder(tmp_path / "run", verdict={"word": word, "sentence": "s"})
+    assert f"<b>What to do:</b> {TO_DO[word].split(',')[0]}" in unescape(write_report(folder).read_text())
 
 
 def test_a_run_that_has_not_ended_says_so(whole):

@@ -17,7 +17,7 @@ from madoc.errors import MadocError, printable
 from madoc.report import words
 from madoc.report.reading import Run, read_run
 from madoc.report.sections import SECTIONS
-from madoc.report.words import TONES, count, duration, number, percent
+from madoc.report.words import TO_DO, TONES, count, duration, number, percent
 from madoc.runs.files import replacing
 
 GENERATOR = "madoc report"
@@ -97,12 +97,13 @@ def run_context(run: Run) -> dict[str, object]:
 
 @dataclass(frozen=True)
 class Headline:
-    """The top of a page: the verdict (or how the run ended), its colour class, the reason, and how the run ended."""
+    """The top of a page: the verdict (or how the run ended), its colour class, the reason, how it ended, what to do."""
 
     word: str
     tone: str
     sentence: str
     note: str
+    to_do: str = ""
 
 
 _LIBRARY = "PLOTLY IS NOT NEEDED"
@@ -120,8 +121,8 @@ def headline(run: Run) -> Headline:
         sentence = "The run has not ended: this page shows what it has done so far."
         return Headline((run.status or "NOT ENDED").upper(), "doubtful", sentence, run.sentence)
     if run.result.verdict is not None:
-        verdict = run.result.verdict
-        return Headline(verdict.word.replace("_", " "), TONES[verdict.word], verdict.sentence, run.sentence)
+        verdict, word = run.result.verdict, run.result.verdict.word
+        return Headline(word.replace("_", " "), TONES[word], verdict.sentence, run.sentence, TO_DO[word])
     if run.result.status in _UNJUDGED:
         return Headline(run.result.status.upper(), *_UNJUDGED[run.result.status], run.sentence)
     sentence = "Nothing was held out, so this estimate was not tried on data it has not seen."

@@ -15,6 +15,17 @@ TONES = {
     "DATA_REJECTED": "bad",
 }
 """Class in the style sheet of each verdict's colour."""
+TO_DO = {
+    "CALIBRATED": "use the model, within the intervals of its values: madoc export writes it for other tools",
+    "USABLE": "use the calibrated model in MuJoCo as it is, and do not take its values for the machine's own; better, "
+    "find on the machine what the sentence above describes, put it into the spec, and calibrate again",
+    "NO_IMPROVEMENT": "give it a larger budget (--budget), or try another method (--method)",
+    "NOT_IDENTIFIABLE": "log motion that moves what the sentence above names, log more, or calibrate fewer parameters",
+    "MODEL_MISMATCH": "do not use these values; find on the machine what the sentence above describes, and where it "
+    "gives a line for the spec, add that line and calibrate again",
+    "DATA_REJECTED": "check the order of the rows, and which columns of the log the spec reads",
+}
+"""What to do first after each verdict."""
 
 _METRIC_WORDS = {
     "residual": "residual; 1 is what a signal usually changes in a step",
