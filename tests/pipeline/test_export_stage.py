@@ -4,11 +4,12 @@ import json
 
 from madoc import robots
 from madoc.calibration import CalibrationResult, ParameterEstimate
+from madoc.commands.main import main
 from madoc.pipeline import export_run
 from own_robots import SERVO, SERVO_SPEC, write_robot
 
 
-def test_a_drive_goes_to_bam_and_no_file_for_trainers_leaves_it_out(tmp_path):
+def test_a_drive_goes_to_bam_and_no_file_for_trainers_leaves_it_out(tmp_path, capsys):
     spec = SERVO_SPEC.replace(
         "parameters:", "friction:\n  - {joint: shaft, model: M1, coulomb: 0.1, viscous: 0.2}\nparameters:"
     )
@@ -35,3 +36,5 @@ def test_a_drive_goes_to_bam_and_no_file_for_trainers_leaves_it_out(tmp_path):
         "randomization.yaml",
         "sysid_parameters.yaml",
     ]
+    assert main(["export", str(tmp_path / "result.json"), "--out", str(tmp_path / "out")]) == 0
+    assert "no file for mjlab, Isaac Lab and Playground" in capsys.readouterr().out
