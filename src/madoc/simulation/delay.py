@@ -56,8 +56,8 @@ def blend(
 
     Weights of a single value are those of all values of an action.
     """
-    terms = weights[:, None] * actions[:, :, None]
-    total = terms[..., 0, :]
-    for index in range(1, terms.shape[-2]):
-        total = total + terms[..., index, :]
+    total = weights[:, None, :, 0] * actions[:, :, None, 0]
+    for index in range(1, weights.shape[2]):
+        if weights[:, :, index].any():
+            total += weights[:, None, :, index] * actions[:, :, None, index]
     return total
