@@ -23,7 +23,7 @@ from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.simulation.base import Simulator
 from madoc.types import named_key
 from madoc.verdict.fitted_starts import FittedReplays, fitted_replays_of, replay_steps
-from madoc.verdict.prediction import MOST_WINDOWS, Replays, replays_of
+from madoc.verdict.prediction import MOST_WINDOWS, WHOLE_STEPS, Replays, replays_of
 from madoc.verdict.statistics import better_than_chance
 from madoc.verdict.two_sample import WindowView, behaviour, classify, rolled
 
@@ -34,6 +34,8 @@ _NEIGHBOURS = 5000
 FITTING, LEAST_FITTING = 0.4, 0.1
 """Share in (0, 1) of the time left that fitting the starts of the hold-out's windows may take, and the least: where
 tests of what the model lacks leave less, there is no time for them."""
+REPLAYED, REPLAYING = 12, 0.3
+"""Simulations of a window of the hold-out from its logged state, and the share in (0, 1) of the time left for them."""
 COLUMNS, COLUMNS_OF_A_VALUE = 60, 20
 """Simulations of a window that testing a model takes about, and how many more for each parameter and each degree of
 freedom."""
@@ -152,8 +154,11 @@ class Bench:
 
     @cached_property
     def replays(self) -> Replays:
-        """Windows of the hold-out to replay from logged states, where states can be rebuilt."""
-        return replays_of(self.held_out, self.simulator, self.change, horizons(self.problem.dataset))
+        """Windows of the hold-out to replay from logged states, where states can be rebuilt, as there is time for."""
+        lengths = horizons(self.problem.dataset)
+        steps = lengths[-1] * (REPLAYED + WHOLE_STEPS * (1 + len(self.simulator.parameters)))
+        most = self.windows_in_time(steps, REPLAYING, MOST_WINDOWS)
+        return replays_of(self.held_out, self.simulator, self.change, lengths, most)
 
     @cached_property
     def fitted(self) -> FittedReplays | None:

@@ -16,7 +16,7 @@ from madoc.identification.systematic import EXPLAINED, autocorrelation, explaine
 from madoc.identification.windows import consecutive_rows, evenly
 from madoc.simulation.attitudes import differences
 from madoc.verdict.bench import Bench
-from madoc.verdict.prediction import Replays, nearby_best
+from madoc.verdict.prediction import WHOLE_STEPS, Replays, nearby_best
 from madoc.verdict.records import judged
 from madoc.verdict.statistics import (
     NEGLIGIBLE,
@@ -28,8 +28,6 @@ from madoc.verdict.statistics import (
     relative_to_first,
 )
 
-WHOLE_STEPS = 3
-"""Number of Gauss-Newton steps on whole windows, at least 1; they begin at the minimum of single steps."""
 MOST_ROWS = 4000
 """Largest number of held-out rows whose residuals are compared with those of later rows."""
 TOUCHING = 0.1

@@ -21,6 +21,8 @@ WORST = 1.0
 """Smallest error, in typical changes of a stride, of a window whose simulation failed."""
 NEARBY_STEPS = 8
 """Largest number of Gauss-Newton steps from an estimate: enough to reach the nearest local minimum."""
+WHOLE_STEPS = 3
+"""Number of Gauss-Newton steps on whole windows, at least 1; they begin at the minimum of single steps."""
 _STILL = 1e-7
 """Largest component in [-1, 1] of a step; the search ends after a smaller one."""
 _CANDIDATES = 2
@@ -129,9 +131,13 @@ def magnitudes(
 
 
 def replays_of(
-    held: Dataset, simulator: Simulator, scale: Float[np.ndarray, " observation"], lengths: tuple[int, ...]
+    held: Dataset,
+    simulator: Simulator,
+    scale: Float[np.ndarray, " observation"],
+    lengths: tuple[int, ...],
+    most: int = MOST_WINDOWS,
 ) -> Replays:
-    """Windows spread evenly over the hold-out, of those `lengths` in control steps that it is long enough for.
+    """At most so many windows, evenly over the hold-out, of the `lengths` in control steps that it is long enough for.
 
     Raises:
         MadocError: None of its states can be rebuilt.
@@ -141,7 +147,7 @@ def replays_of(
     starts = {length: rows_that_fit(held, rows, length) for length in lengths}
     enough = min(FEWEST_WINDOWS, len(starts[lengths[0]]))
     horizons = tuple(horizon for horizon in lengths if len(starts[horizon]) >= enough)
-    chosen = evenly(starts[horizons[-1]], MOST_WINDOWS)
+    chosen = evenly(starts[horizons[-1]], most)
     return Replays(
         simulator,
         windows_at(held, states[chosen], rows[chosen], horizons[-1]),
