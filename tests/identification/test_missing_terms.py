@@ -10,7 +10,7 @@ from madoc import robots, simulation
 from madoc.data import Disturbance, disturb, logs, typical_change
 from madoc.identification import missing_terms as terms
 from madoc.identification.candidate_effects import _cut_off
-from madoc.identification.candidate_terms import EARLY, LATE_DRIVE, LATE_SENSOR, Candidate, is_late
+from madoc.identification.candidate_terms import EARLY, INTEGRATION, LATE_DRIVE, LATE_SENSOR, Candidate, is_late
 from madoc.identification.drifts import (
     DRIFT,
     ONE_RUN,
@@ -258,7 +258,7 @@ def test_friction_that_is_likely_counts_though_it_is_not_significant(noise, coun
     space = ParameterSpace((Parameter("gravity", "", -11, -9),))
     tests = TermTests(products, tried, space, np.full(1, 0.01), np.zeros(16, int))
     (name,) = space.names
-    found = list(terms._of_friction(tests, []))
+    found = list(terms._within_bounds(tests, []))
     assert terms._chosen(tests) == [] and bool(found) is counts
     if counts:
         # The interval of the friction is 0.02 ± 0.036, of which [0, 0.056] is physical: the parameter moves by as much
@@ -267,7 +267,41 @@ def test_friction_that_is_likely_counts_though_it_is_not_significant(noise, coun
         assert high == pytest.approx(0.056, abs=0.002)
         assert found[0].shifts[name] == pytest.approx(-50.0 * high)
         assert found[0].errors[name] == pytest.approx(50.0 * high)
-    assert list(terms._of_friction(tests, [0])) == []
+    assert list(terms._within_bounds(tests, [0])) == []
+
+
+@pytest.mark.parametrize(("told", "low", "high"), [(0.0, 0.0, terms.WHOLE), (0.6, 0.6, 0.6), (-0.5, None, None)])
+def test_the_error_of_the_integration_step_is_covered_as_far_as_the_log_does_not_exclude_it(told, low, high):
+    """As the friction above: of the steps' effect, (1, 1), or (1, 0) where it is imitated, the parameter has (1, 0)."""
+    own, slope = np.ones((16, 2)), np.tile([1.0, 0.0], (16, 1))
+    own[:, 1] = 1.0 if told else 0.0
+    residuals = -told * own + 0.002 * np.array([[0.0, 1.0], [0.0, -1.0]] * 8)
+    products = Products.of(residuals, slope[..., None], own[..., None])
+    tried = (Candidate(INTEGRATION, "", "", 0.0, 1.0, -np.inf),)
+    space = ParameterSpace((Parameter("gravity", "", -11, -9),))
+    tests = TermTests(products, tried, space, np.full(1, 0.1), np.zeros(16, int))
+    found = list(terms._within_bounds(tests, []))
+    assert bool(found) is (low is not None)
+    for each in found:  # the parameter goes back by as much, in half-widths of 0.1
+        (shift,), (error,) = each.shifts.values(), each.errors.values()
+        assert each.bounded and shift == pytest.approx(-10.0 * 0.5 * (low + high), abs=0.05)
+        assert error == pytest.approx(10.0 * 0.5 * (high - low), abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("cause", "value", "fits"), [(INTEGRATION, 0.9, False), (INTEGRATION, 3.0, True), (EARLY, 0.9, True)]
+)
+def test_terms_beside_the_error_of_the_integration_step_are_not_fitted_without_it(cause, value, fits):
+    """A refit can have a spec's parameters alone, so the steps' error would be in their values."""
+    by_value, by_step, by_term = np.random.default_rng(0).standard_normal((3, 16, 8))
+    noise = 0.01 * np.random.default_rng(1).standard_normal((16, 8))
+    residuals = noise - value * by_step - 0.5 * by_term
+    products = Products.of(residuals, by_value[..., None], np.stack([by_step, by_term], axis=-1))
+    tried = (Candidate(cause, "", "", 0.0, 1.0, -np.inf), Candidate("drag", "dof_drag.hinge", "N", 0.0, 1.0, 0.0))
+    space = ParameterSpace((Parameter("gravity", "", -11, -9),))
+    tests = TermTests(products, tried, space, np.full(1, 1e-3), np.zeros(16, int))
+    chosen = terms._chosen(tests)
+    assert sorted(chosen) == [0, 1] and terms._beside_steps(tests, chosen) is not fits
 
 
 def test_a_drive_saturates_at_both_ends_of_what_it_is_asked_for(tmp_path):

@@ -58,6 +58,12 @@ def test_each_end_moves_out_to_the_alternatives_own_interval():
     )
 
 
+def test_all_of_what_bounds_hold_is_covered_with_its_own_interval():
+    # Values from 0 to 4 have intervals of ±1 each: from -1 to 5.
+    bounded = Alternative(("steps",), {"mass": 2.0}, {"mass": 2.0}, bounded=True)
+    assert widening((bounded,), ("mass",)) == pytest.approx(np.array([[0.0, 4.0]]))
+
+
 def test_terms_are_tested_without_the_error_of_the_timestep_where_it_explains_much_or_as_much_as_any():
     step, late = term(INTEGRATION, t=3.5, explained=0.057, parameter=""), term("late", explained=0.056)
     assert to_remove([late, step]) is step and felt([late, step]) is None

@@ -30,7 +30,7 @@ from madoc.identification.information import NORMAL_95
 from madoc.identification.joint_forces import force_effects, is_joint_force
 from madoc.identification.replay import Readings
 from madoc.identification.responses import Responses, responses_of
-from madoc.identification.score_tests import deviate, joint_shift, parameter_shift, score
+from madoc.identification.score_tests import deviate, imitators, joint_shift, parameter_shift, score
 from madoc.identification.states import LoggedStates
 from madoc.identification.term_tests import (
     DISAGREEING,
@@ -61,6 +61,9 @@ _AT_MINIMUM = 1e-3
 """Distance in [-1, 1] from the end of a range, up to which a parameter is at its minimum."""
 LIKELY_FRICTION = 1.0
 """t from which Coulomb friction counts though it is not significant; 16 % of joints without any reach it by chance."""
+WHOLE = 1.5
+"""Largest value of the error of the integration step. The value is 1 / (1 - 4^-p) for an integrator of order p, at
+most 4 / 3, as the steps compared with are a quarter as long."""
 OTHER_WINDOWS = "windows of another length, which give another estimate"
 
 
@@ -138,7 +141,7 @@ def suspicions(
     chosen = _chosen(tests)
     fitted, with_chosen = _of_chosen(tests, chosen, simulator, readings, fit, point)
     terms = [fitted.get(term.parameter, term) for term in terms]
-    others += [*with_chosen, *_of_friction(tests, chosen), *_of_forces(tests, chosen)]
+    others += [*with_chosen, *_within_bounds(tests, chosen), *_of_forces(tests, chosen)]
     most_significant_first = sorted(terms, key=lambda term: -abs(term.t))
     where = concentration(dataset, windows, fit, simulator.task.signal_names, simulator.control_step)
     found = tuple(most_significant_first), tuple(others), tuple(imitated_terms(tests))
@@ -184,13 +187,19 @@ def _of_chosen(
     if not chosen:
         return {}, []
     together, terms, others = _with_terms(tests, chosen), dict[str, MissingTerm](), list[Alternative]()
-    if max(map(abs, together.shifts.values())) >= WORTH_FITTING:
+    if max(map(abs, together.shifts.values())) >= WORTH_FITTING and not _beside_steps(tests, chosen):
         terms, others = _fitted(tests, chosen, simulator, readings, fit, point)
     if len(terms) < len(chosen):
         others.append(together)
     further = [*_rivals(tests, chosen), *_further(tests, chosen)]
     others += [_with_terms(tests, rivals) for rivals in further]
     return terms, others
+
+
+def _beside_steps(tests: TermTests, chosen: list[int]) -> bool:
+    """Whether the error of the integration step is among the chosen: in a fit without it other terms would have it."""
+    steps = (tests.score(index) for index in chosen if tests.tried[index].cause == INTEGRATION)
+    return any(found is not None and 0.0 < found.change <= WHOLE for found in steps)
 
 
 def _terms(tests: TermTests) -> Iterator[MissingTerm]:
@@ -342,22 +351,26 @@ def _fitted(
     return terms, [Alternative(causes, shifts, tests.by_name(beyond))]
 
 
-def _of_friction(tests: TermTests, chosen: list[int]) -> Iterator[Alternative]:
-    """The estimates with as much Coulomb friction in a joint as its 95 % interval holds, cut off at its least value.
+def _within_bounds(tests: TermTests, chosen: list[int]) -> Iterator[Alternative]:
+    """The estimates with as much of a term as its 95 % interval holds and is possible, if it is not `chosen` anyway.
 
-    Nearly every joint has some. Where noise hides it, it biases a damping by several standard errors before it is
-    significant itself. A joint whose friction is among the `chosen` terms has an alternative already.
+    Nearly every joint has Coulomb friction: where noise hides it, it biases a damping by several standard errors. And a
+    machine has no integration steps: parameters imitate their error, as a delay does half a step.
     """
     for index, candidate in enumerate(tests.tried):
-        if candidate.cause != FIELDS["dof_frictionloss"].missing or index in chosen:
+        of_step = candidate.cause == INTEGRATION
+        if index in chosen or not (of_step or candidate.cause == FIELDS["dof_frictionloss"].missing):
             continue
-        found = tests.score(index)
-        if found is None or found.t < LIKELY_FRICTION:
+        found, imitated = tests.score(index), imitators(tests.products, 1 + tests.products.count + index)
+        least = 0.0 if of_step else (candidate.least - candidate.nominal) / candidate.reference
+        if found is not None and (of_step or found.t >= LIKELY_FRICTION):
+            low, high, by_one = found.change - found.reach, found.change + found.reach, found.shifts / found.change
+        elif of_step and imitated is not None:
+            low, high, by_one = 0.0, WHOLE, imitated
+        else:
             continue
-        least = (candidate.least - candidate.nominal) / candidate.reference
-        low, high = (max(least, found.change + sign * found.reach) for sign in (-1.0, 1.0))
-        by_friction = found.shifts / found.change
-        shift, error = 0.5 * (low + high) * by_friction, 0.5 * (high - low) * np.abs(by_friction)
+        low, high = np.clip((low, high), least, WHOLE if of_step else np.inf)
+        shift, error = 0.5 * (low + high) * by_one, 0.5 * (high - low) * np.abs(by_one)
         if np.max((np.abs(shift) + error) / tests.half_widths) >= WORTH_FITTING:
             yield tests.alternative((named(candidate),), shift, error, bounded=True)
 

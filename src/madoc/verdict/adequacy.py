@@ -14,7 +14,7 @@ from madoc.identification.combinations import Combination
 from madoc.identification.drifts import ONE_RUN, WITHIN_RUNS, is_change
 from madoc.identification.information import NORMAL_95
 from madoc.identification.joint_forces import is_joint_force
-from madoc.identification.missing_terms import OTHER_WINDOWS
+from madoc.identification.missing_terms import OTHER_WINDOWS, WHOLE
 from madoc.identification.term_tests import SUSPICIOUS, Alternative, MissingTerm, named
 from madoc.verdict.statistics import ABOVE_NOISE, NEGLIGIBLE, beyond_noise
 
@@ -27,9 +27,6 @@ CERTAIN_STEP = 4.0
 """t of the error of the integration step, whose value is known beforehand; by chance one in 30 thousand is larger."""
 MOVES = 0.5
 """Shift of a parameter in half-widths of its 95 % interval, from which a term is named before others."""
-WHOLE = 1.5
-"""Largest value of the error of the integration step. The value is 1 / (1 - 4^-p) for an integrator of order p, at
-most 4 / 3, as the steps compared with are a quarter as long."""
 SMALLEST = 0.3
 """Smallest value of the error of the integration step in proportion to which its effects are taken larger."""
 NUMERICAL = 0.3
@@ -275,20 +272,20 @@ def widening(alternatives: tuple[Alternative, ...], names: tuple[str, ...]) -> F
     An alternative's own interval is its estimate and, to either side, the root of the sum of the squares of the given
     half-width and of half the 99 % interval of the shift: the two are independent, as terms are tested beside the
     parameters. The shift's interval is the wider one because a model that lacks something is to be covered more surely
-    than a right one.
+    than a right one. Of a shift with bounds all values within them are covered, each with the given half-width.
     """
     ends = np.ones((len(names), 2))
     for each in alternatives:
         for index, name in enumerate(names):
             if name in each.shifts:
-                shift, reach = each.shifts[name], float(np.hypot(1.0, _reach(each, name)))
+                shift, reach = each.shifts[name], _reach(each, each.errors[name], 1.0)
                 ends[index] = np.maximum(ends[index], [reach - shift, reach + shift])
     return ends - 1.0
 
 
-def _reach(alternative: Alternative, name: str) -> float:
-    """Half of the 99 % interval of a shift, or its bound."""
-    return (1.0 if alternative.bounded else SURER) * alternative.errors[name]
+def _reach(alternative: Alternative, error: float, half_width: float) -> float:
+    """How far an alternative's own interval reaches, whose shift has an error or a bound."""
+    return half_width + error if alternative.bounded else float(np.hypot(half_width, SURER * error))
 
 
 def with_widened_intervals(result: CalibrationResult, holdout: HoldOut) -> CalibrationResult:
@@ -325,15 +322,15 @@ def _covering(
     low, high = combination.interval
     below, above = combination.estimate - low, high - combination.estimate
     for each in alternatives:
-        shift = reach = 0.0
+        shift = error = 0.0
         for name, factor in combination.parameters.items():
             row = result.parameters[name]
             if name in each.shifts and row.interval is not None:
                 slope = factor if combination.kind == "sum" else factor * combination.estimate / row.estimate
                 half = slope * row.half_width
-                shift, reach = shift + half * each.shifts[name], reach + abs(half) * _reach(each, name)
-        low = min(low, combination.estimate + shift - float(np.hypot(below, reach)))
-        high = max(high, combination.estimate + shift + float(np.hypot(above, reach)))
+                shift, error = shift + half * each.shifts[name], error + abs(half) * each.errors[name]
+        low = min(low, combination.estimate + shift - _reach(each, error, below))
+        high = max(high, combination.estimate + shift + _reach(each, error, above))
     return replace(combination, interval=(low, high))
 
 

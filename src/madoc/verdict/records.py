@@ -68,10 +68,10 @@ def _doubts(
     """What the log says against the model, and whether that was tested with a finer integration step.
 
     Where the error of the integration step explains much, or as much as any certain term, it may hide others or look
-    like one. These are then tested with steps of a quarter of the length, unless their error explains much there too. A
-    log that tells neither states nor what is needed to fit them cannot be tested, nor can one without pairs of
-    consecutive observations. Under a limit of time windows are as many as that allows. With `shorter` they are so many
-    times as short and as many.
+    like one. These are then tested with steps of a quarter of the length, on as many windows as there is time for, and
+    that counts unless their error explains much there too. A log that tells neither states nor what is needed to fit
+    them cannot be tested, nor can one without pairs of consecutive observations. Under a limit of time windows are as
+    many as that allows. With `shorter` they are so many times as short and as many.
     """
     problem, task = bench.problem, bench.problem.simulator.task
     ordered = bool((problem.dataset.episode_ends - problem.dataset.episode_starts > 1).any())
@@ -83,18 +83,22 @@ def _doubts(
     part = "tests of what the model lacks" if shorter == 1 else "the same tests on shorter windows"
     if not bench.begins(part, 0.0 if enough else np.inf):
         return Suspicions(tested=False), False
-    if shorter == 1 and most is not None:
-        usual = windows_of(*given, bench.change, fewest=bench.windows_to_test)
-        if most < len(usual.rows):
-            bench.left_out.append(FEWER)
+    usual = len(windows_of(*given, bench.change, fewest=bench.windows_to_test).rows)
+    if shorter == 1 and most is not None and most < usual:
+        bench.left_out.append(FEWER)
     doubts = suspicions(*given, problem.simulator, point, half_widths, bench.change, most=most, shorter=shorter)
     alternatives = in_full((*doubts.alternatives, *of_small_terms(doubts.terms)), doubts.terms)
     doubts = replace(doubts, alternatives=alternatives)
     step = to_remove(doubts.terms)
     if step is None or task.source is None:
         return doubts, False
-    if not bench.begins("the same tests with a finer timestep", FINER * doubts.control_steps / bench.rate):
+    seconds, used = FINER * doubts.control_steps / bench.rate, usual if most is None else min(usual, most)
+    in_time = int(used * min(1.0, TESTING * bench.seconds_left / max(seconds, 1e-9)))
+    if not bench.begins("the same tests with a finer timestep", 0.0 if in_time >= bench.windows_to_test else np.inf):
         return doubts, False
+    if in_time < used:
+        bench.left_out.append(FEWER)
+        most = in_time
     finer = simulation.make(task.with_time_step(1.0 / FINER, substeps=FINER))
     fine = suspicions(*given, finer, point, half_widths, bench.change, of_other_model=True, most=most, shorter=shorter)
     spent = doubts.control_steps + FINER * fine.control_steps
