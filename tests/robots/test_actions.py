@@ -1,11 +1,20 @@
 """Actions of a spec: servos, limits and units, by hand."""
 
+import re
+
+import jax
+import mujoco
 import numpy as np
 import pytest
 
-from madoc import robots
+from madoc import robots, simulation
+from madoc.calibration import CalibrationProblem, LeastSquares, calibrate
+from madoc.data import logs
+from madoc.errors import MadocError
 from madoc.simulation.cpu import CpuSimulator
+from madoc.verdict import assess
 from own_robots import BOUNCER, BOUNCER_SPEC, CART_SPEC, task_of, write_robot
+from robots import PENDULUM
 
 
 def test_a_servo_pulls_to_its_target(tmp_path):
@@ -55,3 +64,50 @@ def test_limits_that_the_model_gives_are_in_the_unit_of_the_action(tmp_path):
     spec = BOUNCER_SPEC.replace("low: -1, high: 1}", "unit: mm}")
     (action,) = robots.load(write_robot(tmp_path, spec, bouncer=model)).task.actions
     assert (action.low, action.high, action.scale) == (pytest.approx(-20.0), pytest.approx(30.0), 1e-3)
+
+
+FREE = """\
+madoc: 1
+name: free
+model: pendulum.xml
+control_step: 0.02
+signals:
+  - {name: angle, reads: position(pivot), unit: rad}
+actions: []
+parameters:
+  - {field: dof_damping, element: pivot, low: 0, high: 0.5}
+"""
+
+
+SWINGING = re.sub("<actuator>.*</actuator>", "", PENDULUM)
+
+
+def test_a_machine_without_a_drive_is_calibrated_from_how_it_swings(tmp_path):
+    robot, rng = robots.load(write_robot(tmp_path, FREE, pendulum=SWINGING)), np.random.default_rng(0)
+    model, readings = robot.task.compile(), []
+    model.dof_damping[0] = 0.06
+    for start in (-2.0, -1.2, 0.8, 1.6):
+        data = mujoco.MjData(model)
+        data.qpos[0] = start
+        for row in range(150):
+            readings.append([0.02 * row, data.qpos[0] + 0.002 * rng.standard_normal()])
+            mujoco.mj_step(model, data, 2)
+    folder = tmp_path / "logs"
+    folder.mkdir()
+    for run, rows in enumerate(np.array(readings).reshape(4, 150, 2)):
+        np.savetxt(folder / f"{run}.csv", rows, delimiter=",", header="time,angle", comments="")
+    dataset = logs.read(folder, robot)
+    assert dataset.transitions.action.shape == (len(dataset), 0)
+    train, held = dataset.split(0.25)
+    problem = CalibrationProblem(train, simulation.make(robot.task, threads=1))
+    assessed = assess(calibrate(LeastSquares(), problem, key=jax.random.key(0)), held)
+    assert assessed.verdict.word == "CALIBRATED", assessed
+    low, high = assessed.result.interval[0]
+    assert low < 0.06 < high and high - low < 0.01
+
+
+def test_a_reward_needs_an_action_and_an_actuator_has_to_be_driven(tmp_path):
+    with pytest.raises(MadocError, match="line 7: a reward: is for a policy, which needs an action"):
+        robots.load(write_robot(tmp_path, FREE + "reward: -angle ** 2\n", pendulum=SWINGING))
+    with pytest.raises(MadocError, match="line 7: expected actions, as the model has the actuators pivot"):
+        robots.load(write_robot(tmp_path, FREE))

@@ -139,7 +139,7 @@ def _check_finite(values: np.ndarray, name: str) -> None:
 
 
 def _check_actions(action: np.ndarray, name: str) -> None:
-    size = np.abs(action).max(axis=1)
+    size = np.abs(action).max(axis=1, initial=0.0)
     rows = np.flatnonzero(size > 1.0 + ACTION_TOLERANCE)
     if len(rows):
         raise MadocError(

@@ -109,7 +109,8 @@ class Readings:
         system = simulator.bind(simulator.parameters.to_physical(np.clip(point, -1.0, 1.0))[None])
         after = system.roll_out(states[None], self.actions[None])[0]
         visited = np.concatenate([states[:, None], after[:, :-1]], axis=1)
-        flat_states, flat_actions = (each.reshape(1, -1, each.shape[-1]) for each in (visited, self.actions))
+        rows = len(self) * self.steps
+        flat_states, flat_actions = (each.reshape(1, rows, each.shape[-1]) for each in (visited, self.actions))
         exerted = system.actuator_forces(flat_states, flat_actions)
         return visited, exerted.reshape(*visited.shape[:2], *exerted.shape[2:])
 

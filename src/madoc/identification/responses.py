@@ -69,7 +69,8 @@ def responses_of(
     model, tangent = simulator.task.model, Tangent.of(simulator.task.model)
     motion, drives = readings.trajectories(simulator, point, states)
     motion[~whole], drives[~whole] = np.nan, np.nan
-    start, actions = (each[whole].reshape(-1, each.shape[-1]) for each in (motion, readings.actions))
+    rows = int(whole.sum()) * readings.steps
+    start, actions = (each[whole].reshape(rows, each.shape[-1]) for each in (motion, readings.actions))
     system = simulator.bind(simulator.parameters.to_physical(np.clip(point, -1.0, 1.0))[None])
     speed = np.sqrt((start[:, model.nq : model.nq + model.nv] ** 2).mean(0)) if len(start) else np.zeros(model.nv)
     by_speed = _WIDTH * np.maximum(speed, _SLOWEST)

@@ -124,6 +124,8 @@ def read_episode(draft: Draft, signals: Signals, actions: tuple[ActionChannel, .
     reset = ResetFunction(functions["reset"], signals.layout) if "reset" in functions else None
     reward: Callable[[Batch, Batch, Batch], Batch] = no_reward
     ended: Callable[[Batch], Batch] = never_terminated
+    if not actions and (spec.reward is not None or "reward" in functions):
+        raise draft.document.error(("actions",), "a reward: is for a policy, which needs an action to choose; add one")
     if "reward" in functions:
         reward = partial(_function_reward, reader, functions["reward"])
     elif spec.reward is not None:

@@ -200,7 +200,7 @@ class RobotSpec(Part):
     control_step: Duration = Field(description="Time between two actions, s; a whole multiple of the timestep.")
     timestep: Duration | None = Field(None, description="Of the physics, s. Default: the model's.")
     signals: list[SignalSpec] = Field(min_length=1, description="The observation, in this order.")
-    actions: list[ActionSpec] = Field(min_length=1, description="The action, in this order.")
+    actions: list[ActionSpec] = Field(description="The action, in this order; [] of a machine without a drive.")
     friction: list[FrictionSpec] = Field([], description="Friction of joints, whose terms are calibrated too.")
     gears: list[GearSpec] = Field([], description="Backlash and elasticity between motors and links.")
     conditions: list[ConditionSpec] = Field([], description="What differs between runs and is known.")

@@ -97,6 +97,11 @@ def make_robot(content: bytes, file: str, files: ModelFiles, python: PythonFile 
         raise
     signals = read_signals(draft, model)
     actions = (*(action_channel(draft, model, index) for index in range(len(spec.actions))), *inputs)
+    if model.nu and not actions:
+        own = ", ".join(model.actuator(index).name or str(index) for index in range(model.nu))
+        raise draft.document.error(
+            ("actions",), f"expected actions, as the model has the actuators {own}; list them, or take them out of it"
+        )
     space, frame_skip = parameter_space(draft, model), _frame_skip(draft, model)
     check_timestep(draft, model, space)
     single = tuple(dict.fromkeys(name for row in space.parameters for name in diagonal_bodies(model, row)))
