@@ -97,6 +97,7 @@ def test_mjlab_gets_actuators_by_their_command_and_what_they_act_on_and_a_floati
         replace(motor, name="pull", joint="", tendon="rope"),
         replace(motor, name="thrust", joint="", site="rotor.1"),
         replace(motor, name="glue", joint=""),
+        replace(motor, name="moment", joint="", site="rotor.1"),
     )
     robot = replace(ROBOT, actuators=(motor, *others), base=((0.0, 0.0, 0.3), (1.0, 0.0, 0.0, 0.0)), delay=0.0)
     save_mjlab(path, robot, PARAMETERS)
@@ -109,7 +110,7 @@ def test_mjlab_gets_actuators_by_their_command_and_what_they_act_on_and_a_floati
         (("rope",), "effort", "tendon"),
         (("rotor\\.1",), "effort", "site"),
     ]
-    assert "glue drives no hinge" in text and "import TransmissionType" in text
+    assert "commands glue" in text and "commands moment" in text and "import TransmissionType" in text
     assert "pos=(0.0, 0.0, 0.3)" in text and "rot=(1.0, 0.0, 0.0, 0.0)" in text
     save_mjlab(path, replace(ROBOT, actuators=()), PARAMETERS)
     assert "import \n" not in path.read_text() and "ACTUATORS = (\n)" in path.read_text()

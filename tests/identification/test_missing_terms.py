@@ -10,7 +10,7 @@ from madoc import robots, simulation
 from madoc.data import Disturbance, disturb, logs, typical_change
 from madoc.identification import missing_terms as terms
 from madoc.identification.candidate_effects import _cut_off
-from madoc.identification.candidate_terms import EARLY, INTEGRATION, LATE_DRIVE, LATE_SENSOR, Candidate, is_late
+from madoc.identification.candidate_terms import EARLY, INTEGRATION, LATE_DRIVE, LATE_SENSOR, WHOLE, Candidate, is_late
 from madoc.identification.drifts import (
     DRIFT,
     ONE_RUN,
@@ -270,7 +270,9 @@ def test_friction_that_is_likely_counts_though_it_is_not_significant(noise, coun
     assert list(terms._within_bounds(tests, [0])) == []
 
 
-@pytest.mark.parametrize(("told", "low", "high"), [(0.0, 0.0, terms.WHOLE), (0.6, 0.6, 0.6), (-0.5, None, None)])
+@pytest.mark.parametrize(
+    ("told", "low", "high"), [(0.0, 0.0, WHOLE), (0.6, 0.6, 0.6), (-0.5, None, None), (3.0, None, None)]
+)
 def test_the_error_of_the_integration_step_is_covered_as_far_as_the_log_does_not_exclude_it(told, low, high):
     """As the friction above: of the steps' effect, (1, 1), or (1, 0) where it is imitated, the parameter has (1, 0)."""
     own, slope = np.ones((16, 2)), np.tile([1.0, 0.0], (16, 1))

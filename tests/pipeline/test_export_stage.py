@@ -37,4 +37,4 @@ def test_a_drive_goes_to_bam_and_no_file_for_trainers_leaves_it_out(tmp_path, ca
         "sysid_parameters.yaml",
     ]
     assert main(["export", str(tmp_path / "result.json"), "--out", str(tmp_path / "out")]) == 0
-    assert "no file for mjlab, Isaac Lab and Playground" in capsys.readouterr().out
+    assert "no robot for mjlab and Isaac Lab" in capsys.readouterr().out

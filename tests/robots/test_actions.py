@@ -9,6 +9,7 @@ import pytest
 
 from madoc import robots, simulation
 from madoc.calibration import CalibrationProblem, LeastSquares, calibrate
+from madoc.commands.main import main
 from madoc.data import logs
 from madoc.errors import MadocError
 from madoc.simulation.cpu import CpuSimulator
@@ -73,6 +74,7 @@ model: pendulum.xml
 control_step: 0.02
 signals:
   - {name: angle, reads: position(pivot), unit: rad}
+  - {name: speed, reads: velocity(pivot)}
 actions: []
 parameters:
   - {field: dof_damping, element: pivot, low: 0, high: 0.5}
@@ -90,12 +92,13 @@ def test_a_machine_without_a_drive_is_calibrated_from_how_it_swings(tmp_path):
         data = mujoco.MjData(model)
         data.qpos[0] = start
         for row in range(150):
-            readings.append([0.02 * row, data.qpos[0] + 0.002 * rng.standard_normal()])
+            readings.append([0.02 * row, *(np.append(data.qpos, data.qvel) + 0.002 * rng.standard_normal(2))])
             mujoco.mj_step(model, data, 2)
     folder = tmp_path / "logs"
     folder.mkdir()
-    for run, rows in enumerate(np.array(readings).reshape(4, 150, 2)):
-        np.savetxt(folder / f"{run}.csv", rows, delimiter=",", header="time,angle", comments="")
+    for run, rows in enumerate(np.array(readings).reshape(4, 150, 3)):
+        np.savetxt(folder / f"{run}.csv", rows, delimiter=",", header="time,angle,speed", comments="")
+    assert main(["check", str(tmp_path / "robot.yaml"), "--data", str(folder), "--no-forecast"]) == 0
     dataset = logs.read(folder, robot)
     assert dataset.transitions.action.shape == (len(dataset), 0)
     train, held = dataset.split(0.25)
@@ -107,7 +110,7 @@ def test_a_machine_without_a_drive_is_calibrated_from_how_it_swings(tmp_path):
 
 
 def test_a_reward_needs_an_action_and_an_actuator_has_to_be_driven(tmp_path):
-    with pytest.raises(MadocError, match="line 7: a reward: is for a policy, which needs an action"):
+    with pytest.raises(MadocError, match="line 8: a reward: is for a policy, which needs an action"):
         robots.load(write_robot(tmp_path, FREE + "reward: -angle ** 2\n", pendulum=SWINGING))
-    with pytest.raises(MadocError, match="line 7: expected actions, as the model has the actuators pivot"):
+    with pytest.raises(MadocError, match="line 8: expected actions, as the model has the actuators pivot"):
         robots.load(write_robot(tmp_path, FREE))

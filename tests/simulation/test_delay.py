@@ -95,6 +95,8 @@ def test_blending_is_the_weighted_sum():
     shares = np.array([[[0.25, 0.75], [1.0, 0.0]]])[..., None]
     actions = np.array([[[[1.0, 8.0], [-1.0, 4.0]]]])
     np.testing.assert_array_equal(blend(shares, actions), [[[[-0.5, 5.0], [1.0, 8.0]]]])
+    shares, actions = (np.insert(each, 1, value, axis=2) for each, value in ((shares, 0.0), (actions, 7.0)))
+    np.testing.assert_array_equal(blend(shares, actions), [[[[-0.5, 5.0], [1.0, 8.0]]]])
 
 
 @pytest.fixture

@@ -16,8 +16,7 @@ from madoc.data.findings import Finding
 from madoc.data.split import hold_out
 from madoc.errors import MadocError
 from madoc.identification.candidate_terms import INTEGRATION
-from madoc.identification.missing_terms import Suspicions
-from madoc.identification.term_tests import Alternative
+from madoc.identification.term_tests import Alternative, Suspicions
 from madoc.verdict import Bench
 from own_robots import SPRING_SPEC, write_robot
 from robots import SPRING_TRUTH, recorded

@@ -74,7 +74,8 @@ class Export:
 
     The model as MJCF, the patch of what changed with units, intervals and where they come from, ranges to
     randomize in, draws of whole models for Gymnasium, MuJoCo and MJX (Playground), the robot for mjlab and for
-    Isaac Lab, drives for BAM, and parameters for mujoco.sysid. Each file says what it cannot.
+    Isaac Lab, drives for BAM, and parameters for mujoco.sysid. The first lines of the robot's files name what these
+    cannot say.
     """
 
     folder: Annotated[Positional[Path], arg(metavar="RUN")]
@@ -95,5 +96,5 @@ class Export:
         files = export_run(self.folder, self.out, onnx=self.onnx, rerun=self.rerun, permission=self.permission)
         lines = tuple(f"{what}: {path}" for what, path in files.items())
         if "robot for mjlab" not in files:
-            lines += ("no file for mjlab, Isaac Lab and Playground, as they leave out what drives.py computes",)
+            lines += ("no robot for mjlab and Isaac Lab, as they, and draws.py, leave out what drives.py computes",)
         return Answer({"files": {what: str(path) for what, path in files.items()}}, lines)

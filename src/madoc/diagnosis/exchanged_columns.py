@@ -127,7 +127,7 @@ def _corrections(dataset: Dataset, simulator: Simulator, *, exchanged: bool) -> 
     """
     action, names = np.asarray(dataset.transitions.action, np.float64), action_names(simulator.task)
     ends = np.stack([action.min(0), action.max(0)])
-    limit = _BEYOND * max(1.0, float(np.abs(ends).max()))
+    limit = _BEYOND * max(1.0, float(np.abs(ends).max(initial=0.0)))
     told = [channel.command for channel in simulator.task.actions] or [True] * len(names)
     commands = {name: [index] for index, (name, command) in enumerate(zip(names, told, strict=True)) if command}
     of_actions = _of_columns("action", commands, len(names), exchanged)

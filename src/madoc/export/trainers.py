@@ -61,9 +61,15 @@ def save_mjlab(path: Path, robot: Robot, exported: Sequence[Exported]) -> None:
     """
     lag, unsaid = _lag(robot)
     groups: dict[tuple[tuple[str, str], ...], list[str]] = {}
+    commanded: set[str] = set()
+    untold = []
     for each in robot.actuators:
-        if target := each.joint or each.tendon or each.site:
-            groups.setdefault(tuple(_of_mjlab(each).items()), []).append(target)
+        target = each.joint or each.tendon or each.site
+        if not target or target in commanded:
+            untold.append(each.name)
+            continue
+        commanded.add(target)
+        groups.setdefault(tuple(_of_mjlab(each).items()), []).append(target)
     delay = {"delay_min_lag": str(lag), "delay_max_lag": str(lag)} if lag else {}
     actuators = [
         (kind, {"target_names_expr": _tuple(map(re.escape, targets)), **dict(arguments), **delay})
@@ -72,8 +78,10 @@ def save_mjlab(path: Path, robot: Robot, exported: Sequence[Exported]) -> None:
     placed = [field for field in robot.fields if field.partition("_")[0] in _PLACED]
     left = [field for field in robot.fields if field not in placed]
     unsaid += [f"draws do not reach {field}, which stays that of model.xml" for field in left]
-    untold = [each.name for each in robot.actuators if not (each.joint or each.tendon or each.site)]
-    unsaid += [f"{name} drives no hinge, slide, tendon or site, so no actuator here commands it" for name in untold]
+    unsaid += [
+        f"no actuator here commands {name}, as it acts on nothing that has a name, or on what another one commands"
+        for name in untold
+    ]
     lost = [*robot.lost, *unsaid, *_around(exported, "dr.encoder_bias adds it to what is observed")]
     if any(each.servo for each in robot.actuators):
         lost.append("commands beyond their range in the spec are not cut off by BuiltinPositionActuatorCfg")
@@ -86,7 +94,7 @@ def save_mjlab(path: Path, robot: Robot, exported: Sequence[Exported]) -> None:
         imported=sorted({kind for kind, _ in actuators}),
         transmissions=any("transmission_type" in arguments for _, arguments in actuators),
         actuators=actuators,
-        servos=_tuple(each.name for each in robot.actuators if each.servo),
+        servos=_tuple(each.name for each in robot.actuators if each.servo and each.name not in untold),
         start=_table(robot.start),
         base=robot.base,
         physics=robot.physics,

@@ -30,6 +30,9 @@ SATURATION = "a drive that saturates below the limit of its actions"
 SPACING = "another time between rows than the spec says, by another rate or a clock that drifts"
 TILTS = ("a base or a floor that is tilted towards x", "a base or a floor that is tilted towards y")
 INTEGRATION = "the error of the model's integration step"
+WHOLE = 1.5
+"""Largest value of the error of the integration step. The value is 1 / (1 - 4^-p) for an integrator of order p, at
+most 4 / 3, as the steps compared with are a quarter as long."""
 LATE_DRIVE = "a drive that acts later than the others"
 LATE_SENSOR = "a sensor that reads late, as behind a filter"
 UNLISTED = "a force that no listed term describes"
@@ -198,3 +201,8 @@ def _candidate(
     return Candidate(
         parameter.kind.missing, parameter.name, parameter.unit, nominal, reference, least, elements, known
     ), parameter
+
+
+def of_steps(value: float) -> bool:
+    """Whether the error of the integration step can have a value; another one is something else that acts alike."""
+    return 0.0 < value <= WHOLE

@@ -6,7 +6,7 @@ would move the estimate are then fitted together with the parameters.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
@@ -14,8 +14,17 @@ from jaxtyping import Float
 from madoc import simulation
 from madoc.data.dataset import Dataset
 from madoc.identification.candidate_effects import effects
-from madoc.identification.candidate_terms import BELOW_MINIMUM, EARLY, INTEGRATION, Candidate, candidates, is_late
-from madoc.identification.concentration import Concentration, alike, concentration
+from madoc.identification.candidate_terms import (
+    BELOW_MINIMUM,
+    EARLY,
+    INTEGRATION,
+    WHOLE,
+    Candidate,
+    candidates,
+    is_late,
+    of_steps,
+)
+from madoc.identification.concentration import alike, concentration
 from madoc.identification.drifts import drifts_of
 from madoc.identification.fitted_windows import (
     Fit,
@@ -38,8 +47,8 @@ from madoc.identification.term_tests import (
     LIKELY_FORCE,
     SUSPICIOUS,
     Alternative,
-    ImitatedTerm,
     MissingTerm,
+    Suspicions,
     TermTests,
     imitated_terms,
     named,
@@ -61,33 +70,7 @@ _AT_MINIMUM = 1e-3
 """Distance in [-1, 1] from the end of a range, up to which a parameter is at its minimum."""
 LIKELY_FRICTION = 1.0
 """t from which Coulomb friction counts though it is not significant; 16 % of joints without any reach it by chance."""
-WHOLE = 1.5
-"""Largest value of the error of the integration step. The value is 1 / (1 - 4^-p) for an integrator of order p, at
-most 4 / 3, as the steps compared with are a quarter as long."""
 OTHER_WINDOWS = "windows of another length, which give another estimate"
-
-
-@dataclass(frozen=True)
-class Suspicions:
-    """What the log says against the model.
-
-    Attributes:
-        terms: Candidates with a physical sign, such as friction that takes energy out, the most significant first.
-        alternatives: Other estimates that it does not exclude.
-        imitated: Terms that the model has none of and of which the log cannot tell whether they are missing.
-        control_steps: Control steps that were simulated to find that out.
-        tested: Whether there were states to begin at, and enough windows.
-        concentration: Where most of what the model leaves unexplained is; None where no place stands out.
-        alike: Correlation of what the fitted model leaves of a reading with what it leaves of the next; 0 for noise.
-    """
-
-    terms: tuple[MissingTerm, ...] = ()
-    alternatives: tuple[Alternative, ...] = ()
-    imitated: tuple[ImitatedTerm, ...] = ()
-    control_steps: int = 0
-    tested: bool = True
-    concentration: Concentration | None = None
-    alike: float = 0.0
 
 
 def suspicions(
@@ -199,7 +182,7 @@ def _of_chosen(
 def _beside_steps(tests: TermTests, chosen: list[int]) -> bool:
     """Whether the error of the integration step is among the chosen: in a fit without it other terms would have it."""
     steps = (tests.score(index) for index in chosen if tests.tried[index].cause == INTEGRATION)
-    return any(found is not None and 0.0 < found.change <= WHOLE for found in steps)
+    return any(found is not None and of_steps(found.change) for found in steps)
 
 
 def _terms(tests: TermTests) -> Iterator[MissingTerm]:
@@ -361,15 +344,20 @@ def _within_bounds(tests: TermTests, chosen: list[int]) -> Iterator[Alternative]
         of_step = candidate.cause == INTEGRATION
         if index in chosen or not (of_step or candidate.cause == FIELDS["dof_frictionloss"].missing):
             continue
-        found, imitated = tests.score(index), imitators(tests.products, 1 + tests.products.count + index)
-        least = 0.0 if of_step else (candidate.least - candidate.nominal) / candidate.reference
+        found, least = (
+            tests.score(index),
+            0.0 if of_step else (candidate.least - candidate.nominal) / candidate.reference,
+        )
+        most = WHOLE if of_step else np.inf
         if found is not None and (of_step or found.t >= LIKELY_FRICTION):
             low, high, by_one = found.change - found.reach, found.change + found.reach, found.shifts / found.change
-        elif of_step and imitated is not None:
-            low, high, by_one = 0.0, WHOLE, imitated
+        elif of_step and (imitated := imitators(tests.products, 1 + tests.products.count + index)) is not None:
+            low, high, by_one = least, most, imitated
         else:
             continue
-        low, high = np.clip((low, high), least, WHOLE if of_step else np.inf)
+        if low > most or high < least:
+            continue
+        low, high = np.clip((low, high), least, most)
         shift, error = 0.5 * (low + high) * by_one, 0.5 * (high - low) * np.abs(by_one)
         if np.max((np.abs(shift) + error) / tests.half_widths) >= WORTH_FITTING:
             yield tests.alternative((named(candidate),), shift, error, bounded=True)

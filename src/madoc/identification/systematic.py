@@ -1,6 +1,7 @@
 """Whether residuals are noise, or a function of the robot's state and action."""
 
 from collections.abc import Callable, Iterator
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -24,8 +25,10 @@ _ROUNDING = 1e-6
 EXPLAINED = 0.1
 """Share in [0, 1] of squared residuals that state and action explain on unseen rows; above it residuals are
 systematic. Noise alone gives at most a few percent of many independent rows."""
-REDRAWN = 19
-"""Number of draws of signs, none of which may have as large a share explained: a significance level of 1 / (19 + 1)."""
+REDRAWN = 39
+"""Number of draws of signs with which a share explained is compared."""
+BY_CHANCE = 1
+"""Number of these draws that may have as large a share explained: (1 + 1) / (39 + 1) is a significance level of 5 %."""
 
 LAGS = range(4, 9)
 """Distances in rows at which residuals are compared: long enough that sensor noise, filters and differences of readings
@@ -122,8 +125,8 @@ def explained_at_end(
         return share
     random, stretch = np.random.default_rng(0), (rows - rows[0]) // steps
     signs = random.choice([-1.0, 1.0], (REDRAWN, stretch[-1] + 1))[:, stretch, None]
-    as_large = any(explained(inputs[done], sign * last, folds)[0] >= share for sign in signs)
-    return 0.0 if as_large else share
+    as_large = (True for sign in signs if explained(inputs[done], sign * last, folds)[0] >= share)
+    return share if len(list(islice(as_large, BY_CHANCE + 1))) <= BY_CHANCE else 0.0
 
 
 def disjoint_folds(rows: Int[np.ndarray, " windows"], steps: int) -> Folds:

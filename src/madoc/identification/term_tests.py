@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from madoc.identification.candidate_terms import DELAY, EARLY, UNLISTED, Candidate
+from madoc.identification.concentration import Concentration
 from madoc.identification.score_tests import Products, Score, imitators, score
 from madoc.parameters import ParameterSpace
 
@@ -90,6 +91,29 @@ class ImitatedTerm:
     cause: str
     parameter: str
     imitators: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Suspicions:
+    """What the log says against the model.
+
+    Attributes:
+        terms: Candidates with a physical sign, such as friction that takes energy out, the most significant first.
+        alternatives: Other estimates that it does not exclude.
+        imitated: Terms that the model has none of and of which the log cannot tell whether they are missing.
+        control_steps: Control steps that were simulated to find that out.
+        tested: Whether there were states to begin at, and enough windows.
+        concentration: Where most of what the model leaves unexplained is; None where no place stands out.
+        alike: Correlation of what the fitted model leaves of a reading with what it leaves of the next; 0 for noise.
+    """
+
+    terms: tuple[MissingTerm, ...] = ()
+    alternatives: tuple[Alternative, ...] = ()
+    imitated: tuple[ImitatedTerm, ...] = ()
+    control_steps: int = 0
+    tested: bool = True
+    concentration: Concentration | None = None
+    alike: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -18,11 +18,13 @@ TONES = {
 TO_DO = {
     "CALIBRATED": "use the model, within the intervals of its values: madoc export writes it for other tools",
     "USABLE": "use the calibrated model in MuJoCo as it is, and do not take its values for the machine's own; better, "
-    "find on the machine what the sentence above describes, put it into the spec, and calibrate again",
-    "NO_IMPROVEMENT": "give it a larger budget (--budget), or try another method (--method)",
-    "NOT_IDENTIFIABLE": "log motion that moves what the sentence above names, log more, or calibrate fewer parameters",
-    "MODEL_MISMATCH": "do not use these values; find on the machine what the sentence above describes, and where it "
-    "gives a line for the spec, add that line and calibrate again",
+    "do what the sentence above says, and calibrate again",
+    "NO_IMPROVEMENT": "do what the sentence above says; else give it a larger budget (--budget), or try another "
+    "method (--method)",
+    "NOT_IDENTIFIABLE": "do what the sentence above says; else log motion that moves these parameters, or calibrate "
+    "fewer of them",
+    "MODEL_MISMATCH": "do not use these values; find what the sentence above describes, on the machine or in the "
+    "spec and the log; where it gives a line for the spec, add that line; then calibrate again",
     "DATA_REJECTED": "check the order of the rows, and which columns of the log the spec reads",
 }
 """What to do first after each verdict."""

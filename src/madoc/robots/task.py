@@ -97,8 +97,8 @@ def make_robot(content: bytes, file: str, files: ModelFiles, python: PythonFile 
         raise
     signals = read_signals(draft, model)
     actions = (*(action_channel(draft, model, index) for index in range(len(spec.actions))), *inputs)
-    if model.nu and not actions:
-        own = ", ".join(model.actuator(index).name or str(index) for index in range(model.nu))
+    if draft.base.actuators and not spec.actions:
+        own = ", ".join(actuator.name or "without a name" for actuator in draft.base.actuators)
         raise draft.document.error(
             ("actions",), f"expected actions, as the model has the actuators {own}; list them, or take them out of it"
         )

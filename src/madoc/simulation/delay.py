@@ -58,6 +58,5 @@ def blend(
     """
     total = weights[:, None, :, 0] * actions[:, :, None, 0]
     for index in range(1, weights.shape[2]):
-        if weights[:, :, index].any():
-            total += weights[:, None, :, index] * actions[:, :, None, index]
+        total += weights[:, None, :, index] * actions[:, :, None, index]
     return total

@@ -9,12 +9,12 @@ from jaxtyping import Float
 from madoc.calibration.holdout import HoldOut, Judged, JudgedByErrors
 from madoc.calibration.result import CalibrationResult
 from madoc.diagnosis.scales import COARSE
-from madoc.identification.candidate_terms import DELAY, EARLY, INTEGRATION, TILTS, UNLISTED, is_late
+from madoc.identification.candidate_terms import DELAY, EARLY, INTEGRATION, TILTS, UNLISTED, is_late, of_steps
 from madoc.identification.combinations import Combination
 from madoc.identification.drifts import ONE_RUN, WITHIN_RUNS, is_change
 from madoc.identification.information import NORMAL_95
 from madoc.identification.joint_forces import is_joint_force
-from madoc.identification.missing_terms import OTHER_WINDOWS, WHOLE
+from madoc.identification.missing_terms import OTHER_WINDOWS
 from madoc.identification.term_tests import SUSPICIOUS, Alternative, MissingTerm, named
 from madoc.verdict.statistics import ABOVE_NOISE, NEGLIGIBLE, beyond_noise
 
@@ -241,7 +241,7 @@ def integration(terms: Sequence[MissingTerm]) -> MissingTerm | None:
     Smaller steps change predictions by that error once, and at contacts derivatives follow less than all of it. A value
     beyond that, or of the other sign, is of something else, such as a late action.
     """
-    return next((term for term in terms if term.cause == INTEGRATION and 0.0 < term.value <= WHOLE), None)
+    return next((term for term in terms if term.cause == INTEGRATION and of_steps(term.value)), None)
 
 
 def in_full(alternatives: tuple[Alternative, ...], terms: Sequence[MissingTerm]) -> tuple[Alternative, ...]:

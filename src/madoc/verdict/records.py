@@ -20,8 +20,8 @@ from madoc.identification.candidate_terms import DELAY, INTEGRATION, LAG
 from madoc.identification.excitation import WINDOWS, expected_half_widths
 from madoc.identification.fitted_windows import SHORTER, windows_of
 from madoc.identification.information import OPEN
-from madoc.identification.missing_terms import OTHER_WINDOWS, Suspicions, suspicions
-from madoc.identification.term_tests import Alternative, MissingTerm
+from madoc.identification.missing_terms import OTHER_WINDOWS, suspicions
+from madoc.identification.term_tests import Alternative, MissingTerm, Suspicions
 from madoc.identification.windows import horizons
 from madoc.parameters import ParameterSpace
 from madoc.verdict.adequacy import (
@@ -68,8 +68,8 @@ def _doubts(
     """What the log says against the model, and whether that was tested with a finer integration step.
 
     Where the error of the integration step explains much, or as much as any certain term, it may hide others or look
-    like one. These are then tested with steps of a quarter of the length, on as many windows as there is time for, and
-    that counts unless their error explains much there too. A log that tells neither states nor what is needed to fit
+    like one. These are then tested with steps of a quarter of the length, on as many windows as there is time for. That
+    counts unless the error of those steps explains much too. A log that tells neither states nor what is needed to fit
     them cannot be tested, nor can one without pairs of consecutive observations. Under a limit of time windows are as
     many as that allows. With `shorter` they are so many times as short and as many.
     """
@@ -94,11 +94,10 @@ def _doubts(
         return doubts, False
     seconds, used = FINER * doubts.control_steps / bench.rate, usual if most is None else min(usual, most)
     in_time = int(used * min(1.0, TESTING * bench.seconds_left / max(seconds, 1e-9)))
-    if not bench.begins("the same tests with a finer timestep", 0.0 if in_time >= bench.windows_to_test else np.inf):
+    enough = in_time >= min(used, bench.windows_to_test)
+    if not bench.begins("the same tests with a finer timestep", 0.0 if enough else np.inf):
         return doubts, False
-    if in_time < used:
-        bench.left_out.append(FEWER)
-        most = in_time
+    most = most if in_time >= used else in_time
     finer = simulation.make(task.with_time_step(1.0 / FINER, substeps=FINER))
     fine = suspicions(*given, finer, point, half_widths, bench.change, of_other_model=True, most=most, shorter=shorter)
     spent = doubts.control_steps + FINER * fine.control_steps
@@ -110,6 +109,8 @@ def _doubts(
     ]
     others = [*doubts.alternatives, *others, *of_small_terms(fine.terms, worth_naming(step))]
     terms = step, *(term for term in fine.terms if term.cause != INTEGRATION)
+    if in_time < used and FEWER not in bench.left_out:
+        bench.left_out.append(FEWER)
     return replace(fine, terms=terms, alternatives=tuple(others), control_steps=spent), True
 
 
