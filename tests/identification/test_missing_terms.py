@@ -26,7 +26,9 @@ from madoc.identification.score_tests import Products
 from madoc.identification.states import states_of
 from madoc.identification.term_tests import TermTests
 from madoc.parameters import FIELDS, Parameter, ParameterSpace
+from own_robots import SPRING_SPEC, write_robot
 from planted_pendulum import NOISE, SPEC, plant
+from robots import SPRING_TRUTH, recorded
 
 
 def scores(dataset, simulator, half_width: float = 0.01):
@@ -304,6 +306,20 @@ def test_terms_beside_the_error_of_the_integration_step_are_not_fitted_without_i
     tests = TermTests(products, tried, space, np.full(1, 1e-3), np.zeros(16, int))
     chosen = terms._chosen(tests)
     assert sorted(chosen) == [0, 1] and terms._beside_steps(tests, chosen) is not fits
+
+
+@pytest.mark.parametrize("beside", [True, False])
+def test_a_log_of_a_finer_simulation_has_no_refit_that_ignores_the_steps(tmp_path, monkeypatch, beside):
+    task = robots.load(write_robot(tmp_path, SPRING_SPEC)).task
+    log = recorded(task.with_time_step(0.25, substeps=4), SPRING_TRUTH, 300, jax.random.key(0))
+    simulator, fitted = simulation.make(task, threads=1), []
+    monkeypatch.setattr(terms, "_fitted", lambda tests, chosen, *rest: fitted.append(chosen) or ({}, []))
+    if not beside:
+        monkeypatch.setattr(terms, "_beside_steps", lambda tests, chosen: False)
+    point = simulator.parameters.to_unit(simulator.parameters.vector(SPRING_TRUTH))
+    states = states_of(log, simulator)
+    terms.suspicions(log, states, simulator, point, np.full(len(point), 1e-3), typical_change(log))
+    assert bool(fitted) is not beside
 
 
 def test_a_drive_saturates_at_both_ends_of_what_it_is_asked_for(tmp_path):
