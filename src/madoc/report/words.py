@@ -18,7 +18,7 @@ TONES = {
 TO_DO = {
     "CALIBRATED": "use the model, within the intervals of its values: madoc export writes it for other tools",
     "USABLE": "use the calibrated model in MuJoCo as it is, and do not take its values for the machine's own; better, "
-    "do what the sentence above says, and calibrate again",
+    "find what the model lacks, put it into the spec and calibrate again, or resume a search that had not settled",
     "NO_IMPROVEMENT": "do what the sentence above says; else give it a larger budget (--budget), or try another "
     "method (--method)",
     "NOT_IDENTIFIABLE": "do what the sentence above says; else log motion that moves these parameters, or calibrate "
