@@ -64,8 +64,8 @@ def test_without_time_nothing_is_said_to_be_tested(result, split):
     assert found.verdict.word == "NOT_IDENTIFIABLE" and not found.holdout.tested
     assert found.holdout.open_loop == () and found.holdout.coarseness == 0.0
     assert found.result.warnings[-1] == (
-        "the budget left no time for exchanged columns, tests of what the model lacks, predictions over longer times; "
-        "a larger one judges in full"
+        "the budget left no time for these parts of judging: exchanged columns; tests of what the model lacks; "
+        "predictions over longer times (give it a larger one)"
     )
     in_full = madoc.assess(result, replace(bench, until=time.monotonic() + 1000.0, rate=1e5))
     assert max(in_full.holdout.open_loop[0].beside_noise.values()) < 1.3

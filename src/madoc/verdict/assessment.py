@@ -108,7 +108,9 @@ def assess(
     warnings = [each for each in widened.warnings if each not in refuted]
     warnings += [*about_imitated(holdout), *([] if better else [NO_BETTER])]
     if bench.left_out:
-        warnings.append(f"the budget left no time for {', '.join(bench.left_out)}; a larger one judges in full")
+        warnings.append(
+            f"the budget left no time for these parts of judging: {'; '.join(bench.left_out)} (give it a larger one)"
+        )
     settled = result.settled and better
     widened = replace(widened, verdict=verdict, holdout=holdout, warnings=warnings, settled=settled)
     widened = replace(widened, judging_seconds=round(time.monotonic() - began, 3))

@@ -141,7 +141,8 @@ def about_model_errors(horizon: int) -> str:
     """A sentence that longer windows leave more, which is for the verdict to judge: not every cause is the model's."""
     return (
         f"over {horizon} control steps the simulator leaves more than noise: starts of windows were not found, "
-        "or the model lacks something, for which the verdict tests; the intervals are those of the shortest windows"
+        "or the model lacks something that adds up (the verdict says whether its tests found any); the intervals are "
+        "those of the shortest windows"
     )
 
 
