@@ -170,10 +170,10 @@ def test_forces_that_are_not_listed_are_named_where_nothing_listed_explains_half
     family = term(f"{UNLISTED} (hip), which grows most with its speed", t=12.0, explained=0.5, parameter="")
     drag = term(f"{WEAKENING} (hip)", t=7.5, explained=0.26, parameter="")
     assert missing_term(held(family, drag)) is drag
-    assert as_likely(held(family, drag), drag) == []
+    assert as_likely(held(family, drag).missing_terms, drag) == []
     weaker, elsewhere = replace(drag, explained=0.24), replace(family, cause=f"{UNLISTED} (knee)", explained=0.45)
     assert missing_term(held(family, weaker)) is family
-    assert as_likely(held(family, elsewhere, weaker), family) == [elsewhere]
+    assert as_likely(held(family, elsewhere, weaker).missing_terms, family) == [elsewhere]
     sentence = judge(held(family, elsewhere)).sentence
     assert f"the model lacks {family.cause}: a value of 1 ± 0.08 N·m explains 50 %" in sentence
     assert f"{elsewhere.cause} would explain nearly as much; look there for what the model leaves out" in sentence
@@ -212,8 +212,8 @@ def test_beside_a_coarse_integration_step_nothing_else_is_named():
 
 def test_terms_that_explain_nearly_as_much_are_as_likely():
     friction, gain = term(explained=0.5), term("another gain", explained=0.45)
-    assert as_likely(held(friction, gain, term("a spring", explained=0.3)), friction) == [gain]
-    assert as_likely(held(friction, term("another gain", t=4.0, explained=0.5)), friction) == []
+    assert as_likely(held(friction, gain, term("a spring", explained=0.3)).missing_terms, friction) == [gain]
+    assert as_likely(held(friction, term("another gain", t=4.0, explained=0.5)).missing_terms, friction) == []
 
 
 def test_a_coarse_integration_step_that_explains_more_is_told_first():
@@ -232,8 +232,8 @@ def test_a_force_of_two_shapes_is_no_rival_of_itself():
     sine, cosine = (
         term("a drive whose gain depends on where the joint is (hip)", t=t, parameter="") for t in (9.0, 8.0)
     )
-    assert as_likely(held(sine, cosine), sine) == []
-    assert as_likely(held(sine, term()), sine) == [term()]
+    assert as_likely(held(sine, cosine).missing_terms, sine) == []
+    assert as_likely(held(sine, term()).missing_terms, sine) == [term()]
 
 
 def test_terms_tested_with_a_finer_step_are_told_beside_the_error_of_the_models_own():

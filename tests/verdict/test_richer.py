@@ -9,11 +9,12 @@ from test_adequacy import held, term
 from madoc.calibration.holdout import RicherModel
 from madoc.data import typical_change
 from madoc.identification import missing_terms
+from madoc.identification.joint_forces import UNEVEN
 from madoc.identification.states import states_of
 from madoc.identification.term_tests import MissingTerm
 from madoc.verdict.mismatch import _advice
 from madoc.verdict.remedies import line_of
-from madoc.verdict.richer import richer_model
+from madoc.verdict.richer import _next, in_turn, richer_model
 from planted_pendulum import plant
 
 WIDTHS = np.array([0.01])
@@ -22,8 +23,8 @@ WIDTHS = np.array([0.01])
 def with_term(dataset, simulator, lacking):
     """The model with the parameter that adds a term, from near the estimate."""
     point = simulator.parameters.to_unit(np.array([0.1]))
-    given = dataset, states_of(dataset, simulator), simulator, point, WIDTHS, typical_change(dataset), lacking
-    return richer_model(*given, finer=False, most=None, shorter=1)
+    given = dataset, states_of(dataset, simulator), simulator, point, WIDTHS, typical_change(dataset), [lacking]
+    return richer_model(*given, finer=False, most=None, shorter=1)[0]
 
 
 @pytest.mark.parametrize(
@@ -55,6 +56,36 @@ def test_the_line_is_given_where_the_model_with_it_explains_the_log_and_no_other
     ):
         assert told in _advice(unsure, friction)
         assert line not in _advice(unsure, friction)
+
+
+def test_what_a_model_with_a_term_still_lacks_is_added_in_turn():
+    """Friction at a hip, then at a knee: both lines are given if nothing is left, and else what the first leaves."""
+    hip, knee = term(), term(parameter="dof_frictionloss.knee")
+    leaves = {1: ("friction at the knee",), 2: ()}
+
+    def tested(terms):
+        return RicherModel(terms[0].parameter, leaves[len(terms)], tuple(terms[1:])), knee
+
+    found = in_turn(hip, tested)
+    assert _advice(replace(held(hip), richer=found), hip) == (
+        "a model with it and friction (dof_frictionloss.knee) explains the log: add to the spec's parameters: "
+        "{field: dof_frictionloss, element: hip, low: 0, high: 2} and "
+        "{field: dof_frictionloss, element: knee, low: 0, high: 2}"
+    )
+    leaves |= {2: ("a spring",), 3: ("a spring",)}
+    assert in_turn(hip, tested) == RicherModel("dof_frictionloss.hip", ("friction at the knee",))
+    assert in_turn(hip, lambda terms: tested(terms) if len(terms) == 1 else None).others == ()
+    assert in_turn(hip, lambda terms: None) is None
+
+
+def test_the_next_term_is_certain_of_a_spec_and_alone():
+    friction = term(explained=0.5)
+    uneven = term(f"{UNEVEN} (hip)", parameter="", explained=0.45)
+    spring = term("a spring", parameter="jnt_stiffness.hip", explained=0.45)
+    assert _next([friction, uneven]) == friction  # no spec can say the other
+    assert _next([friction, spring]) is None
+    assert _next([replace(friction, t=4.9)]) is None
+    assert _next([uneven]) is None
 
 
 def test_a_line_has_room_for_its_value_and_keeps_to_what_is_physical():

@@ -137,10 +137,12 @@ class RicherModel:
         parameter: The parameter that was added, as `dof_frictionloss.hinge`.
         left: What this model seems to lack in turn, in words, the most significant term first; none where it explains
             the log.
+        others: Further terms that were added with it, each the likeliest of what the model still lacked.
     """
 
     parameter: str
     left: tuple[str, ...]
+    others: tuple[MissingTerm, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -149,11 +149,11 @@ def _unusual(term: MissingTerm) -> bool:
     return changes or term.cause in (EARLY, *TILTS) or is_joint_force(term.cause) or is_late(term.cause)
 
 
-def as_likely(holdout: HoldOut, named: MissingTerm) -> list[MissingTerm]:
+def as_likely(terms: Sequence[MissingTerm], named: MissingTerm) -> list[MissingTerm]:
     """Other terms that are certain and explain nearly as much: the log hardly tells which of them is missing."""
     return [
         term
-        for term in holdout.missing_terms
+        for term in terms
         if (term.cause, term.parameter) != (named.cause, named.parameter)
         and is_certain(term)
         and not is_change(term.cause)

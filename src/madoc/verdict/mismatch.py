@@ -11,7 +11,7 @@ from madoc.identification.noise import WHITE
 from madoc.identification.systematic import EXPLAINED
 from madoc.identification.term_tests import MissingTerm, named
 from madoc.verdict.adequacy import about_timestep, as_likely, far_beyond_noise, missing_term, numerical
-from madoc.verdict.remedies import WARM_UP, is_of_spec, remedy, value_of
+from madoc.verdict.remedies import WARM_UP, addition, is_of_spec, remedy, value_of
 from madoc.verdict.statistics import NEGLIGIBLE, beyond_noise
 
 PERSISTENT = 0.1
@@ -88,7 +88,7 @@ def _proved(holdout: HoldOut, term: MissingTerm) -> bool:
     """Whether the model with a term explains the log, and no other term explains nearly as much."""
     richer = holdout.richer
     explains = richer is not None and richer.parameter == term.parameter and not richer.left
-    return explains and not as_likely(holdout, term)
+    return explains and not as_likely(holdout.missing_terms, term)
 
 
 def _advice(holdout: HoldOut, term: MissingTerm) -> str:
@@ -96,12 +96,14 @@ def _advice(holdout: HoldOut, term: MissingTerm) -> str:
 
     Terms that explain nearly as much are told with it.
     """
-    others = list(dict.fromkeys(map(named, as_likely(holdout, term))))[:_MOST_NAMED]
+    others = list(dict.fromkeys(map(named, as_likely(holdout.missing_terms, term))))[:_MOST_NAMED]
     alike = f"{' or '.join(others)} would explain nearly as much" if others else ""
     if not is_of_spec(term):
         return "; ".join(part for part in (alike, remedy(term)) if part)
     if _proved(holdout, term):
-        return f"a model with it explains the log: {remedy(term)}"
+        further = holdout.richer.others if holdout.richer is not None else ()
+        whole = " and ".join(("it", *map(named, further)))
+        return f"a model with {whole} explains the log: {addition((term, *further))}"
     richer = holdout.richer
     if richer is None or richer.parameter != term.parameter:
         whole = "whether that is all that it lacks was not tested, so look for the cause before you add it to the spec"

@@ -39,7 +39,7 @@ from madoc.verdict.adequacy import (
 )
 from madoc.verdict.bench import Bench
 from madoc.verdict.remedies import is_of_spec, remedy
-from madoc.verdict.richer import richer_model
+from madoc.verdict.richer import Tested, in_turn, richer_model
 from madoc.verdict.statistics import NEGLIGIBLE
 
 _MOST_TERMS = 5
@@ -249,14 +249,18 @@ def _richer(
     finer: bool,
     shorter: int,
 ) -> RicherModel | None:
-    """The model with a term, if a parameter of a spec adds it and there is time to test it."""
+    """The model with a term, and with others in turn, if parameters of a spec add them and there is time for tests."""
     if term is None or not is_of_spec(term) or not doubts.tested:
         return None
-    seconds = doubts.control_steps / bench.rate
-    if not bench.begins(f"the model with {term.parameter}", BEFORE_OTHERS * seconds):
-        return None
-    given = bench.problem.dataset, bench.states, bench.simulator, point, half_widths, bench.change, term
-    return richer_model(*given, finer=finer, most=_windows_in_time(bench), shorter=shorter)
+    given = bench.problem.dataset, bench.states, bench.simulator, point, half_widths, bench.change
+
+    def tested(terms: Sequence[MissingTerm]) -> Tested:
+        part = f"the model with {' and '.join(each.parameter for each in terms)}"
+        if not bench.begins(part, BEFORE_OTHERS * doubts.control_steps / bench.rate):
+            return None
+        return richer_model(*given, terms, finer=finer, most=_windows_in_time(bench), shorter=shorter)
+
+    return in_turn(term, tested)
 
 
 def _contradiction(finding: Finding, term: MissingTerm | None, richer: RicherModel | None, tried: Sequence[str]) -> str:

@@ -1,5 +1,7 @@
 """What a user can do about a term that the model lacks."""
 
+from collections.abc import Sequence
+
 from madoc.identification.body_forces import CUBIC_ALL, WEAKENING_ALL
 from madoc.identification.candidate_terms import (
     BELOW_MINIMUM,
@@ -68,15 +70,23 @@ def line_of(term: MissingTerm) -> Parameter:
     return Parameter(field, elements, low, high, measured_in=term.unit)
 
 
+def addition(terms: Sequence[MissingTerm]) -> str:
+    """The lines of the spec that add terms."""
+    return f"add to the spec's parameters: {' and '.join(map(_entry, terms))}"
+
+
+def _entry(term: MissingTerm) -> str:
+    """A parameter of a spec in YAML."""
+    line = line_of(term)
+    named = f", element: {line.element}" if isinstance(line.element, str) and line.element else ""
+    named = named or (f", elements: [{', '.join(line.elements)}]" if line.elements else "")
+    return f"{{field: {line.field}{named}, low: {line.low:.2g}, high: {line.high:.2g}}}"
+
+
 def remedy(term: MissingTerm) -> str:
     """What to do about a missing term: the line of the spec that adds it, where there is one."""
     if is_of_spec(term):
-        line = line_of(term)
-        named = f", element: {line.element}" if isinstance(line.element, str) and line.element else ""
-        named = named or (f", elements: [{', '.join(line.elements)}]" if line.elements else "")
-        return (
-            f"add to the spec's parameters: {{field: {line.field}{named}, low: {line.low:.2g}, high: {line.high:.2g}}}"
-        )
+        return addition([term])
     if term.cause in REMEDIES:
         return REMEDIES[term.cause]
     if is_late(term.cause):
