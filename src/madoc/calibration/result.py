@@ -212,7 +212,8 @@ class CalibrationResult:
         signals = list(shown[-1].estimate)
         for name in signals[:MOST_SIGNALS]:
             cells = (f"{each.as_given[name]:.2g} → {each.estimate[name]:.2g}" for each in shown)
-            table.add_row(name, *cells, f"{self.holdout.noise.get(name, 0.0):.2g}")
+            noise = self.holdout.noise.get(name, 0.0)
+            table.add_row(name, *cells, f"{noise:.2g}" if noise else "none found")
         if len(signals) > MOST_SIGNALS:
             table.add_row(f"and {len(signals) - MOST_SIGNALS} more in result.json")
         return table
