@@ -43,7 +43,15 @@ def held(*terms, alternatives=()):
     area = Area(0.5, (0.4, 0.6), 400)
     chance = (AgainstChance("the simulator", 0.9, 0.002),)
     return ToldApart(
-        **{"split": "", "rows": 400, "episodes": 1, "estimate": {}, "interval_shares": {}, "against_chance": chance},
+        **{
+            "split": "",
+            "rows": 400,
+            "episodes": 1,
+            "estimate": {},
+            "values": {"mass": (1.2, 0.01)},
+            "interval_shares": {},
+            "against_chance": chance,
+        },
         **{"noise": {}, "control_steps": 0, "area_at_mid_range": area, "area_at_estimate": area},
         missing_terms=terms,
         alternatives=alternatives,
@@ -88,7 +96,10 @@ def test_intervals_and_combinations_cover_the_alternatives():
     assert wide.parameters["damping"].interval == pytest.approx([0.19, 0.71])
     # The sum moves by 0.1 · 3 - 2 · 0.1 · 0.5 = 0.2, known to 2 · 0.1 · 2.4 = 0.48.
     assert wide.combinations[0].interval[1] == pytest.approx(2.2 + np.hypot(0.1, 0.48))
-    told = "intervals were widened to cover what the data does not exclude: "
+    told = (
+        "95 % intervals are wider than the standard deviations, which count noise alone: they also cover what the data "
+        "does not exclude, "
+    )
     assert wide.warnings == [told + "a spring"]
     names = ("drag", "friction", "lag", "a load", "no move")
     shifts = (0.5, 3.0, 2.0, 2.5, 0.0)

@@ -33,7 +33,7 @@ class MissingTerm:
         cause: What the term stands for, in words.
         parameter: The parameter of the spec that adds it, as `dof_frictionloss.hinge`; empty if there is none.
         value: Its estimated value, in `unit`: of a parameter its value in the model.
-        standard_error: Of the value.
+        standard_error: Of the value. That few windows tell of the term it does not count, as `t` and `error` do.
         unit: Unit of the value.
         explained: Share of the squared residuals that it explains, those of initial states and parameters taken away.
         t: The change divided by its standard error, converted from Student's t to the normal deviate of the same tail
@@ -52,6 +52,11 @@ class MissingTerm:
     t: float
     shifts: dict[str, float]
     nominal: float = 0.0
+
+    @property
+    def error(self) -> float:
+        """The standard error of which the value's difference from the model is `t` times as much."""
+        return abs((self.value - self.nominal) / self.t) if self.t else self.standard_error
 
 
 def named(term: MissingTerm | Candidate) -> str:

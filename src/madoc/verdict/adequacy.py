@@ -340,4 +340,7 @@ def _sentence(alternatives: tuple[Alternative, ...], names: tuple[str, ...]) -> 
     furthest = [alternatives[index] for index in np.argsort(-moved, kind="stable") if moved[index] > 0.0]
     causes = [*dict.fromkeys(cause for each in furthest for cause in each.causes)]
     others = f" and {len(causes) - NAMED} more" if len(causes) > NAMED else ""
-    return f"intervals were widened to cover what the data does not exclude: {', '.join(causes[:NAMED])}{others}"
+    return (
+        "95 % intervals are wider than the standard deviations, which count noise alone: they also cover what the data "
+        f"does not exclude, {', '.join(causes[:NAMED])}{others}"
+    )

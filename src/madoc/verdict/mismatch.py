@@ -46,41 +46,45 @@ def _missing(holdout: HoldOut, term: MissingTerm | None) -> Verdict | None:
         return None
     value = value_of(term)
     if is_change(term.cause):
-        return Verdict("MODEL_MISMATCH", f"{_changing(term)}{about_timestep(holdout)}", (term.parameter,))
+        return Verdict("MODEL_MISMATCH", f"{_changing(holdout, term)}{about_timestep(holdout)}", (term.parameter,))
     moved = sorted(term.shifts, key=lambda name: -abs(term.shifts[name]))[:2]
-    effect = " and ".join(f"{name} by {abs(term.shifts[name]):.2g}" for name in moved)
+    effect = " and ".join(_moved(holdout, term, name) for name in moved)
     sure = _proved(holdout, term) or term.cause.startswith(UNLISTED)
     lacks = "the model lacks" if sure else "what the model lacks acts like"
     return Verdict(
         "MODEL_MISMATCH",
         f"{lacks} {named(term)}: a value of {value} explains {100 * term.explained:.2g} % of the squared residuals "
-        f"(t = {abs(term.t):.0f}), and would move {effect} half-widths of the interval"
-        f"{about_timestep(holdout, term)}; {_advice(holdout, term)}{_at_end(holdout)}{_disagreeing(holdout)}",
+        f"(t = {abs(term.t):.0f}), and would move {effect}{about_timestep(holdout, term)}; {_advice(holdout, term)}"
+        f"{_at_end(holdout)}{_disagreeing(holdout)}",
         tuple(moved),
     )
 
 
-def _changing(term: MissingTerm) -> str:
+def _moved(holdout: HoldOut, term: MissingTerm, name: str) -> str:
+    """By how much a term would move an estimate, in the parameter's unit."""
+    estimate, half_width = holdout.values[name]
+    return f"{name} by {half_width * term.shifts[name]:+.2g} from {estimate:.4g}"
+
+
+def _changing(holdout: HoldOut, term: MissingTerm) -> str:
     """How a parameter changes over the log, by how much, and what to do."""
-    value, within = value_of(term), term.cause == WITHIN_RUNS
-    moved = (
-        f"(t = {abs(term.t):.0f}), which is {(1 + within) * abs(term.shifts[term.parameter]):.2g} half-widths of its"
-    )
+    value = value_of(term)
+    moved = f"(t = {abs(term.t):.0f}; its estimate is {holdout.values[term.parameter][0]:.3g})"
     if term.cause.startswith(ONE_RUN):
         run = term.cause.removeprefix(f"{ONE_RUN} (").removesuffix(")")
         return (
-            f"{term.parameter} is another one in {run}: it differs there by {value} from all other runs {moved} "
-            "interval; find out what was different in that run, or leave it out"
+            f"{term.parameter} is another one in {run}: it differs there by {value} from all other runs {moved}; "
+            "find out what was different in that run, or leave it out"
         )
-    if within:
-        change = value_of(replace(term, value=2.0 * term.value, standard_error=2.0 * term.standard_error))
+    if term.cause == WITHIN_RUNS:
+        change = value_of(replace(term, value=2.0 * term.value))
         return (
             f"{term.parameter} drifts: it changes within each run by {change} from the start of a run to its end "
-            f"{moved} interval; {WARM_UP}"
+            f"{moved}; {WARM_UP}"
         )
     return (
-        f"{term.parameter} drifts: it changes by {value} between parts of the log {moved} interval; calibrate to each "
-        "run by itself"
+        f"{term.parameter} drifts: it changes by {value} between parts of the log {moved}; calibrate to each run by "
+        "itself"
     )
 
 
@@ -116,7 +120,7 @@ def _advice(holdout: HoldOut, term: MissingTerm) -> str:
 
 def _at_end(holdout: HoldOut) -> str:
     """Which estimates are at an end of their range, where other terms may make up for what lies beyond it."""
-    names = ", ".join(holdout.at_end)
+    names = ", ".join((*holdout.at_end, *holdout.open_at_end))
     return f"; {names} at the end of the range: the true value may lie beyond it, so widen it first" if names else ""
 
 

@@ -165,12 +165,17 @@ def judged(
     shares = _shares(*widths, doubts.alternatives)
     of_range = dict(zip(space.names, shares.tolist(), strict=True))
     narrower = _shares(*widths, () if FEWER in bench.left_out else doubts.alternatives)
-    signals = bench.simulator.task.signal_names[: len(noise)]
+    at_end = [space.names.index(name) for name in space.at_end(point, ends)]  # an open one tells of no end
+    by_noise = _shares(*widths, ())
+    signals, halves = bench.simulator.task.signal_names[: len(noise)], own * (space.high - space.low) / 2.0
     found = record(
         split=bench.split,
         rows=len(bench.held_out),
         episodes=len(bench.held_out.episode_starts),
         estimate=dict(zip(space.names, point.tolist(), strict=True)),
+        values=dict(
+            zip(space.names, zip(space.to_physical(point).tolist(), halves.tolist(), strict=True), strict=True)
+        ),
         interval_shares=of_range,
         against_chance=(*by_model, *bench.model_free),
         noise=dict(zip(signals, (noise * bench.change[: len(noise)]).tolist(), strict=True)),
@@ -181,9 +186,8 @@ def judged(
         open_in_time=tuple(itertools.compress(space.names, (shares >= OPEN) & (narrower < OPEN))),
         coarseness=coarse,
         finer=finer,
-        at_end=tuple(
-            name for name in space.at_end(point, ends) if narrower[space.names.index(name)] < OPEN
-        ),  # an open one tells of no end
+        at_end=tuple(space.names[index] for index in at_end if narrower[index] < OPEN),
+        open_at_end=tuple(space.names[index] for index in at_end if by_noise[index] < OPEN <= narrower[index]),
         concentration=doubts.concentration,
     )
     shorter = SHORTER if far_beyond_noise(found) and missing_term(found) is None else 1

@@ -51,7 +51,7 @@ def value_of(term: MissingTerm) -> str:
     """The value of a missing term with its standard error and unit, and what the model has where that is not 0."""
     unit = "" if term.unit == "1" else term.unit
     own = f" (the model has {term.nominal:.3g})" if term.nominal else ""
-    return f"{term.value:.3g} ± {term.standard_error:.1g} {unit}".rstrip() + own
+    return f"{term.value:.3g} ± {term.error:.1g} {unit}".rstrip() + own
 
 
 def is_of_spec(term: MissingTerm) -> bool:
