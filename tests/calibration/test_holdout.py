@@ -30,8 +30,8 @@ ROW = (PredictionError(1, 0.1, (0.05, 0.2)),)
 ERRORS = PredictionErrors(ROW, ROW, ROW, ROW, 0.1, (0.08, 0.12), 0.09, 400)
 AREA = Area(0.7, (0.6, 0.8), 400)
 REPORTS = [
-    Predicted(**COMMON, errors=ERRORS, explained=0.0, autocorrelation=0.0),
-    Fitted(**COMMON, errors=ERRORS, explained=0.0),
+    Predicted(**COMMON, errors=ERRORS),
+    Fitted(**COMMON, errors=ERRORS),
     ToldApart(**COMMON, area_at_mid_range=AREA, area_at_estimate=AREA),
 ]
 

@@ -67,8 +67,6 @@ def result(**changes):
         ),
         alternatives=(Alternative(("a spring (jnt_stiffness.hip)",), {"gravity": 0.5}, {"gravity": 0.4}),),
         errors=PredictionErrors(errors, errors, errors, errors, 0.04, (0.03, 0.05), 0.04, 100),
-        explained=0.0,
-        autocorrelation=0.0,
     )
     return {
         "method": "madoc",

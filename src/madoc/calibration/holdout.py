@@ -227,12 +227,9 @@ class JudgedByErrors(Judged):
 
     Attributes:
         errors: The prediction errors.
-        explained: Share of the squared residuals at the best parameters nearby that a regression on earlier values of
-            the log explains.
     """
 
     errors: PredictionErrors
-    explained: float
 
     @property
     def score(self) -> float:
@@ -250,14 +247,10 @@ class Predicted(JudgedByErrors):
     """Windows of the hold-out replayed from logged states, where states can be computed from the log.
 
     Attributes:
-        autocorrelation: Lag-one autocorrelation of the residuals at the best parameters nearby.
-        persistence: Correlation of these residuals with those a few rows later; 0 if it is not certain.
         beside_random: By signal, how many times as large errors of the longest horizon are, at the best parameters
             nearby, as sensor noise and random forces of each step make them; the lower end of a 95 % interval.
     """
 
-    autocorrelation: float
-    persistence: float = 0.0
     beside_random: dict[str, float] = field(default_factory=dict)
     measure: Literal["predicted"] = "predicted"
 

@@ -16,7 +16,7 @@ from madoc.identification.information import NORMAL_95
 from madoc.identification.joint_forces import is_joint_force
 from madoc.identification.missing_terms import OTHER_WINDOWS
 from madoc.identification.term_tests import SUSPICIOUS, Alternative, MissingTerm, named
-from madoc.verdict.statistics import ABOVE_NOISE, NEGLIGIBLE, beyond_noise
+from madoc.verdict.statistics import beyond_noise
 
 CERTAIN = 5.0
 """|t| from which a term is missing; by chance one in two million is larger where residuals are normal."""
@@ -110,17 +110,9 @@ def _is_small(term: MissingTerm, least: float) -> bool:
 
 
 def far_beyond_noise(holdout: Judged) -> bool:
-    """Whether even the parameters nearby that fit the hold-out best leave errors that noise does not explain.
-
-    Noise is what readings and actions do not explain. Where they explain most, errors are beyond it too, though the
-    noise that was estimated is as large: that of slow readings in coarse steps may count slow errors.
-    """
-    if not isinstance(holdout, JudgedByErrors):
-        return False
-    errors = holdout.errors
-    large = any(left.mean > NEGLIGIBLE for left in errors.nearby_best)
-    explained = large and holdout.explained > 1.0 - ABOVE_NOISE**-2.0
-    return explained or bool(beyond_noise(errors.nearby_best, errors.noise, certain=True))
+    """Whether even the parameters nearby that fit the hold-out best leave errors that noise does not explain."""
+    errors = holdout.errors if isinstance(holdout, JudgedByErrors) else None
+    return errors is not None and bool(beyond_noise(errors.nearby_best, errors.noise, certain=True))
 
 
 def likeliest(terms: Sequence[MissingTerm]) -> MissingTerm | None:

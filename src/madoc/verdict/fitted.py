@@ -11,7 +11,6 @@ from madoc.calibration.holdout import AgainstChance, Fitted
 from madoc.data import stride
 from madoc.identification.fitted_windows import LINEARISATIONS, fit_windows
 from madoc.identification.noise import residual_noise
-from madoc.identification.systematic import explained_at_end
 from madoc.simulation.attitudes import moved
 from madoc.verdict.bench import Bench
 from madoc.verdict.fitted_starts import FittedReplays
@@ -38,8 +37,6 @@ def fitted(
     best = best_of(sizes)
     noise = residual_noise(residuals[best][:, : replays.fitted + 1], len(replays.readings.spread))
     alone = _with_noise_alone(bench, replays, points[best], residuals[best], noise)
-    observed, actions = replays.readings.observed, replays.readings.actions
-    start_and_actions = np.concatenate([observed[:, 0], observed[:, 1], actions.reshape(len(actions), -1)], axis=1)
     record = partial(
         Fitted,
         errors=prediction_errors(
@@ -50,7 +47,6 @@ def fitted(
             horizons=replays.ahead,
             stride=stride(bench.problem.dataset),
         ),
-        explained=explained_at_end(start_and_actions, residuals[best], replays.rows),
     )
     return judged(
         record,

@@ -7,15 +7,11 @@ import numpy as np
 from madoc.calibration.holdout import Area, Fitted, HoldOut, Predicted, PredictionErrors, ToldApart, Verdict
 from madoc.identification.candidate_terms import UNLISTED
 from madoc.identification.drifts import ONE_RUN, WITHIN_RUNS, is_change
-from madoc.identification.noise import WHITE
-from madoc.identification.systematic import EXPLAINED
 from madoc.identification.term_tests import MissingTerm, named
 from madoc.verdict.adequacy import about_timestep, as_likely, far_beyond_noise, missing_term, numerical
 from madoc.verdict.remedies import WARM_UP, addition, is_of_spec, remedy, value_of
-from madoc.verdict.statistics import NEGLIGIBLE, beyond_noise
+from madoc.verdict.statistics import NEGLIGIBLE
 
-PERSISTENT = 0.1
-"""Correlation in [-1, 1] of residuals with those a few rows later, above which a force is missing that lasts."""
 BEYOND_RANDOM = 1.3
 """Lower end of the 95 % interval of a signal's error over that of noise and random forces; above it something adds up
 that is not random."""
@@ -168,48 +164,32 @@ def _unlike_noise(holdout: HoldOut) -> Verdict | None:
 def _mismatch(holdout: HoldOut) -> Verdict | None:
     if numerical(holdout) is not None:
         return None
-    at_end = [f"{', '.join(holdout.at_end)} at the end of the range"] if holdout.at_end else []
     if isinstance(holdout, ToldApart):
-        sentence = _separable(holdout.area_at_mid_range, holdout.area_at_estimate, at_end)
+        sentence = _separable(holdout)
     else:
-        sentence = _systematic(holdout, at_end)
+        sentence = _adding_up(holdout) if isinstance(holdout, Predicted) else _from_fitted_starts(holdout)
     if not sentence:
         return None
     return Verdict("MODEL_MISMATCH", f"{sentence}{about_timestep(holdout)}", holdout.at_end)
 
 
-def _systematic(holdout: Predicted | Fitted, at_end: list[str]) -> str:
-    """How the errors of the best parameters nearby differ from noise, in size and for a reason; else empty.
+def _from_fitted_starts(holdout: Fitted) -> str:
+    """How the errors of the best parameters nearby exceed those of noise; else empty.
 
-    Where states can be rebuilt, errors without a reason are compared with those of noise and random forces; where
-    starts are fitted, nothing tells these from what the model lacks, and no reason is needed.
+    Nothing tells random forces from what the model lacks there.
     """
-    errors, direct, reasons = holdout.errors, isinstance(holdout, Predicted), list[str]()
-    if holdout.explained > EXPLAINED:
-        inputs = "state and action" if direct else "readings and actions"
-        reasons.append(f"{inputs} explain {100 * holdout.explained:.0f} % of it")
-    if isinstance(holdout, Predicted) and holdout.autocorrelation > WHITE:
-        reasons.append(f"it is alike from row to row (correlation {holdout.autocorrelation:.2f})")
-    if isinstance(holdout, Predicted) and holdout.persistence > PERSISTENT:
-        lasts = f"it lasts over several rows (correlation {holdout.persistence:.2f})"
-        reasons.append(f"{lasts}, as that of a force from outside would")
-    reasons += at_end
-    if isinstance(holdout, Predicted) and not (reasons and far_beyond_noise(holdout)):
-        return _adding_up(holdout)
     if not far_beyond_noise(holdout):
         return ""
+    errors = holdout.errors
     pairs = list(zip(errors.nearby_best, errors.noise, strict=True))
     left, noise = max(pairs, key=lambda pair: pair[0].mean / max(pair[1].mean, NEGLIGIBLE))
-    noisy = noise.mean > NEGLIGIBLE
-    much = f"{left.mean / noise.mean:.2g} times as much as noise does" if noisy else "none of which is noise"
-    if noisy and not beyond_noise(errors.nearby_best, errors.noise):
-        much = "about what noise was estimated to make, which could not be predicted if it were noise"
-    why = f"; that is no chance, as {' and '.join(reasons)}" if reasons else ""
-    after = f"after {in_rows(left.steps)}{'' if direct else ' from a fitted start'}"
+    much = (
+        f"{left.mean / noise.mean:.2g} times as much as noise does" if noise.mean > NEGLIGIBLE else "none of it noise"
+    )
     return (
-        f"the model cannot explain the data: {after} even the parameters nearby that fit the hold-out best err by "
-        f"{left.mean:.2g} of what a signal changes in {in_rows(errors.stride)}, {much}{why} "
-        f"({change_of(errors)}){_where(holdout)}"
+        f"the model cannot explain the data: after {in_rows(left.steps)} from a fitted start even the parameters "
+        f"nearby that fit the hold-out best err by {left.mean:.2g} of what a signal changes in "
+        f"{in_rows(errors.stride)}, {much} ({change_of(errors)}){_where(holdout)}{_at_end(holdout)}"
     )
 
 
@@ -221,7 +201,7 @@ def _adding_up(holdout: Predicted) -> str:
     return (
         f"the model cannot explain the data: after {in_rows(holdout.errors.nearby_best[-1].steps)} the best parameters "
         f"nearby leave at least {factor:.2g} times the error in {signal} that sensor noise and random forces make "
-        f"({change_of(holdout.errors)}){_where(holdout)}"
+        f"({change_of(holdout.errors)}){_where(holdout)}{_at_end(holdout)}"
     )
 
 
@@ -238,14 +218,15 @@ def _where(holdout: HoldOut) -> str:
     return f"; most of what it leaves in the log that was calibrated to is {' and '.join(places)}"
 
 
-def _separable(before: Area, after: Area, at_end: list[str]) -> str:
+def _separable(holdout: ToldApart) -> str:
     """How well a classifier separates simulated from logged rows, if better than `SEPARABLE`; else empty."""
+    before, after = holdout.area_at_mid_range, holdout.area_at_estimate
     if after.interval[0] <= SEPARABLE or after.area >= before.area:
         return ""
     return (
         f"a classifier still tells rows of the simulator from those held out, {of_area(after)} after {of_area(before)} "
-        f"at mid-range (0.5 is chance){', and '.join(['', *at_end])}: the model cannot move as the data does, or the "
-        "search is not at its end"
+        "at mid-range (0.5 is chance): the model cannot move as the data does, or the search is not at its end"
+        f"{_at_end(holdout)}"
     )
 
 

@@ -9,14 +9,13 @@ from jaxtyping import Float, Int
 from madoc.calibration.holdout import Predicted, PredictionErrors
 from madoc.data import stride
 from madoc.identification import noise as sensors
-from madoc.identification.gauss_newton import DAMPING, descend
 from madoc.identification.losses import NORMAL_MAD
 from madoc.identification.states import logged_states
-from madoc.identification.systematic import EXPLAINED, autocorrelation, explained, explained_at_end, persistence
+from madoc.identification.systematic import explained
 from madoc.identification.windows import consecutive_rows, evenly
 from madoc.simulation.attitudes import differences
 from madoc.verdict.bench import Bench
-from madoc.verdict.prediction import WHOLE_STEPS, Replays, nearby_best
+from madoc.verdict.prediction import Replays, nearby_best
 from madoc.verdict.records import judged
 from madoc.verdict.statistics import (
     NEGLIGIBLE,
@@ -41,15 +40,10 @@ def predicted(bench: Bench, point: Float[np.ndarray, " d"], interval: Float[np.n
     found = _replayed(bench, point)
     best, single = found.best, found.single
     systems = {"the simulator at mid-range": np.zeros(len(point)), "the simulator at the best parameters nearby": best}
-    lasting = _persistence(bench, best)
-    at_end = _explained_at_end(bench, best, found.at_best, point, interval)
     beside = _beside_random(bench, found)
     record = partial(
         Predicted,
         errors=found.errors,
-        explained=max(single.explained, at_end),
-        autocorrelation=single.autocorrelation,
-        persistence=lasting,
         beside_random=dict(zip(bench.simulator.task.signal_names, beside.tolist(), strict=True)),
     )
     return judged(
@@ -186,38 +180,6 @@ def _pushes(
     return (residuals * share)[np.minimum(np.searchsorted(rows, wanted), len(rows) - 1)]
 
 
-def _explained_at_end(
-    bench: Bench,
-    best: Float[np.ndarray, " d"],
-    residuals: Float[np.ndarray, "windows steps observation"],
-    point: Float[np.ndarray, " d"],
-    interval: Float[np.ndarray, "d 2"] | None,
-) -> float:
-    """The share of the last residuals of windows that their start and actions explain.
-
-    Over a whole window an error of a parameter adds up, and that of the estimate is no sign of another model: where
-    parameters fitted to whole windows are within the error of both fits of the estimate at `point`, the smaller share
-    of their residuals counts.
-    """
-    replays, space = bench.replays, bench.simulator.parameters
-    actions = replays.windows.actions.reshape(len(replays.windows), -1)
-    inputs = np.concatenate([replays.observation, actions], axis=1)
-    share = explained_at_end(inputs, residuals, replays.rows)
-    if share <= EXPLAINED or interval is None:
-        return share
-    _, visited = descend(
-        replays.simulator, replays.windows, best, replays.scale, steps=WHOLE_STEPS, loss="cauchy", damping=DAMPING
-    )
-    if not len(visited):
-        return share
-    half_width = np.abs(space.to_unit(interval.T) - point).max(0)
-    of_both = half_width * np.sqrt(1.0 + len(bench.problem.dataset) / len(bench.held_out))
-    if (np.abs(visited[-1] - point) > of_both).any():
-        return share
-    refitted = replays.residuals(visited[-1:])[0]
-    return min(share, explained_at_end(inputs, refitted, replays.rows))
-
-
 def sensor_noise(bench: Bench) -> Float[np.ndarray, " observation"]:
     """Standard deviation of the sensors' noise in their units, without an estimate.
 
@@ -233,11 +195,9 @@ def sensor_noise(bench: Bench) -> Float[np.ndarray, " observation"]:
 
 
 class _SingleSteps(NamedTuple):
-    """Statistics of single steps: residuals' root mean square, the share that state and action explain, and so on."""
+    """Of single steps: residuals' root mean square, and the standard deviation of the sensors' noise in them."""
 
     size: Float[np.ndarray, " observation"]
-    explained: float
-    autocorrelation: float
     noise: Float[np.ndarray, " observation"]
 
 
@@ -245,25 +205,14 @@ def _single_steps(bench: Bench, point: Float[np.ndarray, " d"]) -> _SingleSteps:
     held, rows, scale = bench.held_out, bench.judged_rows, bench.change
     residuals = sensors.clipped(_residuals(bench, point, rows))
     first = np.flatnonzero((np.diff(rows) == 1) & ~np.isin(rows[1:], held.episode_starts))
-    share, explanation = explained(bench.scaling.features(held.transitions.take(rows))[0], residuals)
     noise = np.zeros(len(scale))
     if len(first):
         slopes = sensors.own_slopes(bench.simulator, held, point, rows[first], scale)
-        unexplained = residuals - explanation
+        unexplained = residuals - explained(bench.scaling.features(held.transitions.take(rows))[0], residuals)
         # Both are lower bounds: what is explained of a channel at rest is its own noise in the reading before.
         parts = (sensors.consecutive_noise(part[first], part[first + 1], slopes) for part in (unexplained, residuals))
         noise = np.maximum(*parts)
-    together = autocorrelation(residuals[first], residuals[first + 1])
-    return _SingleSteps(np.sqrt((residuals**2).mean(0)), share, together, noise)
-
-
-def _persistence(bench: Bench, point: Float[np.ndarray, " d"]) -> float:
-    """How residuals of single steps last, over the first rows whose states can be rebuilt."""
-    held = bench.held_out
-    rows = logged_states(held, bench.simulator.task)[1][:MOST_ROWS]
-    residuals = sensors.clipped(_residuals(bench, point, rows))
-    follows = np.concatenate([[False], (np.diff(rows) == 1) & ~np.isin(rows[1:], held.episode_starts)])
-    return persistence(residuals, follows)
+    return _SingleSteps(np.sqrt((residuals**2).mean(0)), noise)
 
 
 def _residuals(
