@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from affine import affine
-from madoc.calibration.baselines.oted.visits import (
+from madoc.calibration.baselines.oted import (
     REWARD_BOUND,
     Distribution,
     advantages,

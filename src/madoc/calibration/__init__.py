@@ -7,7 +7,7 @@ from madoc.calibration.baselines.cma_es.calibrator import CmaEs as CmaEs
 from madoc.calibration.baselines.droid import Droid as Droid
 from madoc.calibration.baselines.dropo import Dropo as Dropo
 from madoc.calibration.baselines.npe.calibrator import Npe as Npe
-from madoc.calibration.baselines.oted.calibrator import Oted as Oted
+from madoc.calibration.baselines.oted import Oted as Oted
 from madoc.calibration.baselines.uncalibrated import Uncalibrated as Uncalibrated
 from madoc.calibration.calibrate import calibrate as calibrate
 from madoc.calibration.least_squares.calibrator import LeastSquares as LeastSquares

@@ -8,7 +8,7 @@ from madoc.calibration.baselines.cma_es.calibrator import CmaEs
 from madoc.calibration.baselines.droid import Droid
 from madoc.calibration.baselines.dropo import ENTROPY_WEIGHT, Dropo
 from madoc.calibration.baselines.npe.calibrator import Npe
-from madoc.calibration.baselines.oted.calibrator import Oted
+from madoc.calibration.baselines.oted import Oted
 from madoc.calibration.baselines.uncalibrated import Uncalibrated
 from madoc.calibration.least_squares.calibrator import LeastSquares
 from madoc.calibration.madoc.calibrator import PAPER, Madoc
