@@ -3,7 +3,7 @@
 from madoc.calibration.base import CalibrationProblem as CalibrationProblem
 from madoc.calibration.base import Calibrator as Calibrator
 from madoc.calibration.base import Estimate as Estimate
-from madoc.calibration.baselines.cma_es.calibrator import CmaEs as CmaEs
+from madoc.calibration.baselines.cma_es import CmaEs as CmaEs
 from madoc.calibration.baselines.droid import Droid as Droid
 from madoc.calibration.baselines.dropo import Dropo as Dropo
 from madoc.calibration.baselines.npe.calibrator import Npe as Npe

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from madoc.calibration.base import Calibrator
-from madoc.calibration.baselines.cma_es.calibrator import CmaEs
+from madoc.calibration.baselines.cma_es import CmaEs
 from madoc.calibration.baselines.droid import Droid
 from madoc.calibration.baselines.dropo import ENTROPY_WEIGHT, Dropo
 from madoc.calibration.baselines.npe.calibrator import Npe

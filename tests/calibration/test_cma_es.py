@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from madoc.calibration.baselines.cma_es.mean_embedding import (
+from madoc.calibration.baselines.cma_es import (
     RIDGE,
     CosineFeatures,
     adjusted,
