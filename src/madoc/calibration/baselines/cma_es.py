@@ -14,9 +14,10 @@ from jaxtyping import Float, PRNGKeyArray
 from pydantic import Field
 
 from madoc.calibration.base import CalibrationProblem, Estimate
-from madoc.calibration.baselines import evolution
-from madoc.calibration.baselines.evolution import Candidates, Costs
 from madoc.calibration.baselines.population_search import (
+    Candidates,
+    Costs,
+    Evolution,
     SearchState,
     estimate_from_search,
     mean_with_failures,
@@ -211,7 +212,7 @@ class CmaEs:
         if not acts:
             first_rows(problem.dataset, problem.states.exact()[1], 1)
         of_features, of_actor, key = jax.random.split(key, 3)
-        search = evolution.begin(np.zeros(len(problem.simulator.parameters)))
+        search = Evolution.about(np.zeros(len(problem.simulator.parameters)))
         clouds = None if self.objective == "one-step" else self._begin_clouds(problem, of_features)
         actor = self._begin_actor(problem, of_actor) if acts else None
         return CmaEsState(SearchState(search, key, 0), clouds, actor)
@@ -224,7 +225,7 @@ class CmaEs:
         if clouds is not None and not clouds.read:
             return replace(state, clouds=self._read(problem, clouds)), Epoch(stage="reading")
         of_candidates, of_rows, key = jax.random.split(inner.key, 3)
-        candidates = evolution.ask(inner.search, of_candidates, self.population)
+        candidates = inner.search.ask(of_candidates, self.population)
         if clouds is None:
             costs, spent, failures = self._one_step(problem, candidates, of_rows)
         elif actor is None:

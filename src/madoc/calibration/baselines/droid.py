@@ -14,7 +14,6 @@ from jaxtyping import Float, PRNGKeyArray
 from pydantic import Field
 
 from madoc.calibration.base import CalibrationProblem, Estimate
-from madoc.calibration.baselines import evolution
 from madoc.calibration.baselines.population_search import (
     SearchState,
     begin_search,
@@ -66,7 +65,7 @@ class Droid:
     def step(self, problem: CalibrationProblem, state: SearchState) -> tuple[SearchState, Epoch]:
         """One generation, all candidates in one batch."""
         of_candidates, of_windows, key = jax.random.split(state.key, 3)
-        candidates = evolution.ask(state.search, of_candidates, self.population)
+        candidates = state.search.ask(of_candidates, self.population)
         residuals = replay_residuals(problem, candidates, of_windows, steps=self.horizon, windows=self.windows)
         by_window = trajectory_cost(residuals, absolute=self.absolute, squared=self.squared)
         return next_generation(

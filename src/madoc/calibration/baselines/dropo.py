@@ -13,7 +13,6 @@ from jaxtyping import Float, Int, PRNGKeyArray
 from pydantic import Field
 
 from madoc.calibration.base import CalibrationProblem, Estimate
-from madoc.calibration.baselines import evolution
 from madoc.calibration.baselines.population_search import (
     SearchState,
     begin_search,
@@ -160,7 +159,7 @@ class Dropo:
     def step(self, problem: CalibrationProblem, state: SearchState) -> tuple[SearchState, Epoch]:
         """One generation: all draws of all candidates in one batch."""
         of_candidates, of_draws, of_windows, key = jax.random.split(state.key, 4)
-        candidates = evolution.ask(state.search, of_candidates, self.population)
+        candidates = state.search.ask(of_candidates, self.population)
         mean, std = distribution_of(candidates)
         draws = parameter_draws(mean, std, truncated_noise(of_draws, self.draws, mean.shape[-1]))
         flat = replay_residuals(
