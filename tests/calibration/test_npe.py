@@ -10,10 +10,26 @@ import pytest
 from affine import affine
 from madoc import simulation
 from madoc.calibration import CalibrationProblem, Npe
-from madoc.calibration.baselines.npe.belief import Belief, doubts, posterior_samples, prior_belief, truncated_box
-from madoc.calibration.baselines.npe.emulator import Cosines, Emulator, emulation_loss, moments, moved
-from madoc.calibration.baselines.npe.flow import Regression
-from madoc.calibration.baselines.npe.summaries import Reader, Sets, by_halves, errors_of, less_noisy
+from madoc.calibration.baselines.npe.moments import (
+    Cosines,
+    Emulator,
+    Reader,
+    Sets,
+    by_halves,
+    emulation_loss,
+    errors_of,
+    less_noisy,
+    moments,
+    moved,
+)
+from madoc.calibration.baselines.npe.posterior import (
+    Belief,
+    Regression,
+    doubts,
+    posterior_samples,
+    prior_belief,
+    truncated_box,
+)
 from madoc.data import Disturbance, disturb
 from robots import ARM_TRUTH, recorded, two_link_arm
 

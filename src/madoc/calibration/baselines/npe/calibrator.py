@@ -16,7 +16,21 @@ from jaxtyping import Float, PRNGKeyArray, PyTree
 from pydantic import Field
 
 from madoc.calibration.base import CalibrationProblem, Estimate, at_end_of_range
-from madoc.calibration.baselines.npe.belief import (
+from madoc.calibration.baselines.npe.moments import (
+    Cosines,
+    Emulator,
+    Sets,
+    by_halves,
+    cosines,
+    fresh_emulator,
+    logged_moments,
+    moved,
+    set_moments,
+    standardised,
+    train,
+    unpaired,
+)
+from madoc.calibration.baselines.npe.posterior import (
     Belief,
     belief_of,
     doubts,
@@ -24,16 +38,6 @@ from madoc.calibration.baselines.npe.belief import (
     prior_belief,
     truncated_box,
 )
-from madoc.calibration.baselines.npe.emulator import (
-    Cosines,
-    Emulator,
-    cosines,
-    fresh_emulator,
-    moved,
-    standardised,
-    train,
-)
-from madoc.calibration.baselines.npe.summaries import Sets, by_halves, logged_moments, set_moments, unpaired
 from madoc.calibration.free_rollouts import begin_freely, require_rows, roll_freely, windows_of
 from madoc.calibration.sensing import SensorNoise, noise_deviation, rows_compared
 from madoc.learning import replay
