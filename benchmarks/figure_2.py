@@ -11,7 +11,7 @@ from paper_cells import asked, how_far, kept, planned, wanted
 from scipy import stats
 
 from madoc.calibration.madoc import grouping
-from madoc.calibration.madoc.actors import draw_parameters
+from madoc.calibration.madoc.agents import draw_parameters
 from madoc.calibration.madoc.state import MadocState
 from madoc.parameters import ParameterSpace
 from madoc.pipeline.calibration_stage import methods_for

@@ -23,7 +23,7 @@ import paper_cells
 import pooling
 import tables
 
-from madoc.calibration.madoc.actors import initial_actors
+from madoc.calibration.madoc.agents import initial_actors
 from madoc.parameters import Parameter, ParameterSpace
 
 STALE = "stale: run make figures"

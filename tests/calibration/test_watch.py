@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from madoc.calibration.madoc.actors import Actors, initial_actors
-from madoc.calibration.madoc.agents import AgentSettings
+from madoc.calibration.madoc.agents import Actors, AgentSettings, initial_actors
 from madoc.calibration.madoc.watch import (
     CLOSE,
     SATURATED,

@@ -1,6 +1,7 @@
 """The networks and distributions that Madoc trains, and the updates that train them."""
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -8,16 +9,141 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
-from madoc.calibration.madoc.actors import Actors, actor_loss, divergence, draw_parameters, initial_actors, prior_weight
-from madoc.calibration.madoc.value_decomposition import GroupCritics, Mixing, value_loss
 from madoc.errors import MadocError
 from madoc.learning import replay
 from madoc.learning.dynamics_ratio import Discriminators, blur, discriminator_loss, log_dynamics_ratio, overlap
-from madoc.learning.networks import Observations, PerRow, Scalar, adam, descend, moving_average, scan_updates
+from madoc.learning.networks import (
+    Network,
+    Observations,
+    PerRow,
+    Scalar,
+    adam,
+    descend,
+    moving_average,
+    scan_updates,
+    stack,
+)
+from madoc.learning.tanh_gaussian import sample
 from madoc.types import BelowOne, Count, Layers, NotNegative, Positive, Share, check_hyperparameters
 
+Mixing = Literal["dop", "sum", "independent"]
+"""How values of groups are mixed into a draw's: by learnt weights (DOP), by a plain sum (VDN), or not at all (ISAC)."""
 AT_BOUND = 0.95
 """Share of the reward's bound above which a reward counts as saturated."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Actors:
+    """Means and log stds before squashing, both of shape (d,).
+
+    They are a tanh-Gaussian for each group: groups are disjoint, and every Gaussian is diagonal.
+    """
+
+    mean: Float[Array | np.ndarray, " d"]
+    log_std: Float[Array | np.ndarray, " d"]
+
+
+def initial_actors(count: int) -> Actors:
+    """Actors at N(0, 1) before squashing, where the prior starts too (appendix C)."""
+    return Actors(jnp.zeros(count), jnp.zeros(count))
+
+
+def squashed(actors: Actors) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
+    """The actors' deterministic output in [-1, 1], and their deviations there, to first order."""
+    mean = np.tanh(np.asarray(actors.mean, np.float64))
+    return mean, (1.0 - mean**2) * np.exp(np.asarray(actors.log_std, np.float64))
+
+
+def draw_parameters(
+    actors: Actors, key: PRNGKeyArray, count: int
+) -> tuple[Float[Array, "count d"], Float[Array, " count"]]:
+    """Draws of all parameters in [-1, 1], and their log densities summed over groups."""
+    shape = (count, len(actors.mean))
+    mean, log_std = (jnp.broadcast_to(part, shape) for part in (actors.mean, actors.log_std))
+    return sample(mean, log_std, key)
+
+
+def divergence(actors: Actors, prior: Actors) -> Float[Array, " d"]:
+    """KL(q || p) of each parameter, in closed form: squashing both by the same map leaves it as it is."""
+    variance_ratio = jnp.exp(2.0 * (actors.log_std - prior.log_std))
+    shift = ((actors.mean - prior.mean) * jnp.exp(-prior.log_std)) ** 2
+    return 0.5 * (variance_ratio + shift - 1.0) - actors.log_std + prior.log_std
+
+
+def prior_weight(updates: Int[Array, ""], *, time_constant: float, largest: float) -> Scalar:
+    """λ_t = min(largest, exp(t / time_constant)) (appendix C: 10 and 2e5)."""
+    return jnp.minimum(largest, jnp.exp(updates / time_constant))
+
+
+def actor_loss(
+    value: PerRow, log_density: PerRow, kl: Scalar, *, entropy_weight: float, prior_weight: Scalar | float
+) -> Scalar:
+    """Eq. (13): α log q - v + λ KL(q || p), averaged over draws; values, densities and KL are sums over groups."""
+    return (entropy_weight * log_density - value).mean() + prior_weight * kl
+
+
+class GroupCritics(eqx.Module):
+    """A value network for each group, which sees the parameters of that group only.
+
+    Attributes:
+        networks: A stack of networks over groups.
+        weight: k of Eq. (11), which starts at 1.
+        bias: b of Eq. (11), which starts at 0.
+        baseline: b(s, a), added to it: a network of the features of (s, a); None for the paper's b alone. How well
+            discriminators judge a row differs from state to state far more than from draw to draw, and what b takes of
+            it is no noise on the values of draws (DOP: Wang et al. 2021, where b depends on the state too).
+    """
+
+    networks: Network
+    weight: Float[Array, " groups"]
+    bias: Scalar
+    baseline: Network | None
+
+    def __init__(
+        self, groups: int, parameters: int, hidden: tuple[int, ...], *, window: int = 0, key: PRNGKeyArray
+    ) -> None:
+        """Fresh critics; with a `window`, the number of features of (s, a), b depends on those."""
+        self.networks = stack(groups, lambda key: Network(parameters, 1, hidden, key=key), key)
+        self.weight = jnp.ones(groups)
+        self.bias = jnp.zeros(())
+        self.baseline = Network(window, 1, hidden, key=jax.random.fold_in(key, groups)) if window else None
+
+    def values(
+        self, parameters: Float[Array, "rows d"], members: Bool[Array, "groups d"]
+    ) -> Float[Array, "rows groups"]:
+        """v_g(ξ^g) of every group; the parameters of other groups are replaced by 0. That of an empty group is 0."""
+        own = jnp.where(members[:, None], parameters[None], 0.0)
+        values = eqx.filter_vmap(lambda network, rows: network(rows)[:, 0])(self.networks, own).T
+        return jnp.where(members.any(-1), values, 0.0)
+
+    def less_baseline(self, reward: PerRow, pair: Float[Array, "rows window"]) -> PerRow:
+        """R - b(s, a), which the values are to explain; R without a baseline."""
+        return reward if self.baseline is None else reward - self.baseline(pair)[:, 0]
+
+
+def total_value(values: Float[Array, "rows groups"], weight: Float[Array, " groups"], bias: Scalar) -> PerRow:
+    """Eq. (11): V_tot = Σ_g |k_g| v_g + b."""
+    return values @ jnp.abs(weight) + bias
+
+
+def value_loss(
+    values: Float[Array, "rows groups"],
+    weight: Float[Array, " groups"],
+    bias: Scalar,
+    reward: PerRow,
+    share: PerRow,
+    mixing: Mixing,
+) -> Scalar:
+    """Eq. (12): half the mean of (V_tot - R)². A bandit: there is no next value.
+
+    Rows are weighted by `share`, whose mean is 1; in the paper every share is 1.
+    `sum` (VDN) has k = 1 and b = 0; `independent` (ISAC) regresses every critic on the shared reward alone.
+    """
+    if mixing == "independent":
+        return 0.5 * (share[:, None] * (values - reward[:, None]) ** 2).mean(0).sum()
+    total = values.sum(-1) if mixing == "sum" else total_value(values, weight, bias)
+    return 0.5 * (share * (total - reward) ** 2).mean()
 
 
 @jax.tree_util.register_dataclass

@@ -17,12 +17,9 @@ from jaxtyping import Float, PRNGKeyArray
 from madoc.calibration.base import CalibrationProblem, Estimate
 from madoc.calibration.free_rollouts import begin_freely, require_rows, roll_freely
 from madoc.calibration.madoc import grouping, watch
-from madoc.calibration.madoc.actors import draw_parameters, squashed
-from madoc.calibration.madoc.agents import AgentSettings
-from madoc.calibration.madoc.collection import Collection, geometry
+from madoc.calibration.madoc.agents import AgentSettings, Mixing, draw_parameters, squashed
 from madoc.calibration.madoc.grouping import Grouping, GroupingVAE, Votes
-from madoc.calibration.madoc.state import MadocState
-from madoc.calibration.madoc.value_decomposition import Mixing
+from madoc.calibration.madoc.state import Collection, MadocState, geometry
 from madoc.calibration.sensing import SensorNoise, noise_deviation, rows_compared
 from madoc.errors import MadocError
 from madoc.learning import replay

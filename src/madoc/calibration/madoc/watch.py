@@ -7,8 +7,7 @@ import jax
 import numpy as np
 
 from madoc.calibration.base import at_end_of_range
-from madoc.calibration.madoc.actors import Actors
-from madoc.calibration.madoc.agents import AgentSettings
+from madoc.calibration.madoc.agents import Actors, AgentSettings
 from madoc.parameters import ParameterSpace
 from madoc.types import Metrics
 
