@@ -135,6 +135,7 @@ class Estimate:
             that are random.
         group_stability: Mean adjusted Rand index of the groups with those found from resampled states, or proposed in
             other epochs; 1 is the same groups, 0 chance. None where groups were not found from the problem.
+        embeddings: One vector for each parameter, close together for those that act alike; None where none was learnt.
     """
 
     mean: Float[np.ndarray, " d"]
@@ -151,14 +152,7 @@ class Estimate:
     effective: bool = False
     random_forces: Float[np.ndarray, " dof"] = field(default_factory=lambda: np.zeros(0))
     group_stability: float | None = None
-
-
-@runtime_checkable
-class EmbedsParameters(Protocol):
-    """The interface of methods that learn which parameters have similar effects."""
-
-    def embeddings(self, problem: CalibrationProblem, state: object) -> Float[np.ndarray, "d latent"] | None:
-        """One vector for each parameter, close together for those that act alike; None before anything is learnt."""
+    embeddings: Float[np.ndarray, "d latent"] | None = None
 
 
 @runtime_checkable

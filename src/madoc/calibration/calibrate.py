@@ -6,7 +6,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from madoc.calibration.base import CalibrationProblem, Calibrator, EmbedsParameters, Estimate
+from madoc.calibration.base import CalibrationProblem, Calibrator, Estimate
 from madoc.calibration.registry import CALIBRATORS
 from madoc.calibration.result import CalibrationResult, ParameterEstimate
 from madoc.data.velocities import dof_names
@@ -100,10 +100,9 @@ def calibrate(
         problem=problem,
     )
     if folder is not None:
-        vectors = method.embeddings(problem, finished.state) if isinstance(method, EmbedsParameters) else None
-        if vectors is not None:
+        if estimate.embeddings is not None:
             with replacing(folder.path / "embeddings.npz") as stream:
-                np.savez(stream, allow_pickle=False, names=np.array(space.names), vectors=vectors)
+                np.savez(stream, allow_pickle=False, names=np.array(space.names), vectors=estimate.embeddings)
         folder.write_json("result.json", result.to_json())
     return result
 

@@ -175,22 +175,18 @@ class Madoc:
     def estimate(self, problem: CalibrationProblem, state: MadocState) -> Estimate:
         """The actors' deterministic output, averaged over updates, where the mismatch was lowest."""
         space, (scaled, std) = problem.simulator.parameters, squashed(state.watch.best)
-        collection, voted = self._collection(problem, state.noise), state.grouped == self.grouping_epochs
+        votes, voted = state.grouping, state.grouped == self.grouping_epochs
         groups = (np.flatnonzero(state.labels == label).tolist() for label in np.unique(state.labels))
         return Estimate(
             mean=space.to_physical(scaled),
             std=std * (space.high - space.low) / 2.0,
             groups=tuple(tuple(group) for group in groups),
-            group_stability=grouping.agreement(state.grouping.schemes) if voted and state.grouping else None,
+            group_stability=grouping.agreement(votes.schemes) if voted and votes else None,
             failures=state.failures,
-            warnings=(*watch.warnings(state.watch, scaled, space), *collection.warnings),
+            warnings=(*watch.warnings(state.watch, scaled, space), *self._collection(problem, state.noise).warnings),
             settled=watch.settled(state.watch),
+            embeddings=np.asarray(votes.vae.embeddings(), np.float64) if votes and state.grouped else None,
         )
-
-    def embeddings(self, problem: CalibrationProblem, state: MadocState) -> np.ndarray | None:
-        """A vector for each parameter, from the VAE's encoder; None before any grouping."""
-        votes = state.grouping if state.grouped else None
-        return None if votes is None else np.asarray(votes.vae.embeddings(), np.float64)
 
     def _collection(self, problem: CalibrationProblem, noise: Float[np.ndarray, " observation"]) -> Collection:
         """How rows of this problem are simulated; what is None in the hyperparameters is chosen here."""
