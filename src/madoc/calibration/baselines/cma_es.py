@@ -24,8 +24,15 @@ from madoc.calibration.baselines.population_search import (
     next_generation,
     replay_residuals,
 )
-from madoc.calibration.free_rollouts import begin_freely, roll_freely, windows_of, without_starts
-from madoc.calibration.sensing import SensorNoise, noise_deviation, rows_compared
+from madoc.calibration.free_rollouts import (
+    SensorNoise,
+    begin_freely,
+    noise_deviation,
+    roll_freely,
+    rows_compared,
+    windows_of,
+    without_starts,
+)
 from madoc.errors import MadocError
 from madoc.identification.windows import first_rows
 from madoc.learning.cloning import Clone, cloning_epoch, fresh_clone

@@ -21,7 +21,7 @@ from madoc.calibration.baselines.population_search import (
     next_generation,
     replay_residuals,
 )
-from madoc.calibration.sensing import SensorNoise, noise_deviation
+from madoc.calibration.free_rollouts import SensorNoise, noise_deviation
 from madoc.types import Count, Epoch, NotNegative, check_hyperparameters
 
 TRUNCATION = 2.0

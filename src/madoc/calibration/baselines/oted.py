@@ -18,8 +18,16 @@ from pydantic import Field
 
 from madoc.calibration.base import CalibrationProblem, Estimate
 from madoc.calibration.baselines.population_search import independent_estimate
-from madoc.calibration.free_rollouts import begin_freely, require_rows, roll_freely, windows_of, without_starts
-from madoc.calibration.sensing import SensorNoise, noise_deviation, rows_compared
+from madoc.calibration.free_rollouts import (
+    SensorNoise,
+    begin_freely,
+    noise_deviation,
+    require_rows,
+    roll_freely,
+    rows_compared,
+    windows_of,
+    without_starts,
+)
 from madoc.data import Dataset
 from madoc.identification.windows import first_rows
 from madoc.learning import replay

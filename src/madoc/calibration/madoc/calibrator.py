@@ -15,12 +15,18 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem, Estimate
-from madoc.calibration.free_rollouts import begin_freely, require_rows, roll_freely
+from madoc.calibration.free_rollouts import (
+    SensorNoise,
+    begin_freely,
+    noise_deviation,
+    require_rows,
+    roll_freely,
+    rows_compared,
+)
 from madoc.calibration.madoc import grouping, watch
 from madoc.calibration.madoc.agents import AgentSettings, Mixing, draw_parameters, squashed
 from madoc.calibration.madoc.grouping import Grouping, GroupingVAE, Votes
 from madoc.calibration.madoc.state import Collection, MadocState, geometry
-from madoc.calibration.sensing import SensorNoise, noise_deviation, rows_compared
 from madoc.errors import MadocError
 from madoc.learning import replay
 from madoc.learning.cloning import cloning_epoch, fresh_clone

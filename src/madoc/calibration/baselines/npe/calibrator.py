@@ -38,8 +38,15 @@ from madoc.calibration.baselines.npe.posterior import (
     prior_belief,
     truncated_box,
 )
-from madoc.calibration.free_rollouts import begin_freely, require_rows, roll_freely, windows_of
-from madoc.calibration.sensing import SensorNoise, noise_deviation, rows_compared
+from madoc.calibration.free_rollouts import (
+    SensorNoise,
+    begin_freely,
+    noise_deviation,
+    require_rows,
+    roll_freely,
+    rows_compared,
+    windows_of,
+)
 from madoc.learning import replay
 from madoc.learning.cloning import Clone, cloning_epoch, fresh_clone
 from madoc.learning.features import HIDDEN_WINDOW

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 from sklearn.covariance import ledoit_wolf
 
 from madoc.calibration.base import CalibrationProblem
-from madoc.calibration.sensing import rows_compared
+from madoc.calibration.free_rollouts import rows_compared
 from madoc.learning import replay
 from madoc.learning.networks import Network, Scalar, falling_adam, minimise, standardise
 

@@ -6,10 +6,9 @@ import pytest
 
 from madoc import simulation
 from madoc.calibration import CalibrationProblem, CmaEs, LeastSquares, Madoc, Oted
-from madoc.calibration.free_rollouts import with_sensor_noise
+from madoc.calibration.free_rollouts import noise_deviation, rows_compared, with_sensor_noise
 from madoc.calibration.least_squares.calibrator import horizon_of
 from madoc.calibration.madoc.state import geometry
-from madoc.calibration.sensing import noise_deviation, rows_compared
 from madoc.data import Disturbance, disturb, observed_task, stride
 from madoc.data.disturbing import row_change
 from madoc.errors import MadocError
