@@ -9,9 +9,8 @@ import pytest
 from madoc import simulation
 from madoc.calibration import CalibrationProblem
 from madoc.calibration.least_squares.known_starts import KnownStarts
-from madoc.calibration.least_squares.plan import Outcome, Plan
+from madoc.calibration.least_squares.plan import Outcome, Plan, touched
 from madoc.calibration.least_squares.search import Search
-from madoc.calibration.least_squares.statistics import touched
 from madoc.calibration.least_squares.unknown_starts import UnknownStarts
 from madoc.data import Disturbance, disturb
 from madoc.identification.gauss_newton import FIRST_DAMPING, TRIALS

@@ -30,9 +30,8 @@ from madoc.calibration.least_squares.lengthening import (
     tells_more,
     with_search,
 )
-from madoc.calibration.least_squares.plan import FEWEST, Found
+from madoc.calibration.least_squares.plan import EXACT, FEWEST, Found, consecutive_residuals, noisy_rows
 from madoc.calibration.least_squares.search import Search, SearchState
-from madoc.calibration.least_squares.statistics import EXACT, consecutive_residuals, noisy_rows
 from madoc.calibration.least_squares.unknown_starts import UnknownStarts
 from madoc.data import stride
 from madoc.errors import MadocError

@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from madoc.calibration.least_squares.instruments import agreed, beyond_chance
-from madoc.calibration.least_squares.plan import FEWEST, Found
-from madoc.calibration.least_squares.statistics import LONG_TAILS
+from madoc.calibration.least_squares.plan import FEWEST, LONG_TAILS, Found
 from madoc.identification.gauss_newton import FIRST_DAMPING
 from madoc.identification.information import sandwich
 from madoc.identification.noise import WHITE

@@ -26,7 +26,7 @@ from madoc.calibration.least_squares.instruments import (
     shares_of,
     surprises,
 )
-from madoc.calibration.least_squares.plan import FEWEST
+from madoc.calibration.least_squares.plan import FEWEST, touched
 from madoc.calibration.least_squares.remainder import (
     LARGE,
     LARGE_ROUNDS,
@@ -36,7 +36,6 @@ from madoc.calibration.least_squares.remainder import (
     with_trial,
     with_what_is_left,
 )
-from madoc.calibration.least_squares.statistics import touched
 from madoc.data import stride
 from madoc.identification.ensembles import SPOILT, FilteredWindows, next_noise, with_noise
 from madoc.identification.gauss_newton import TRIALS, damped_step

@@ -15,10 +15,9 @@ from jaxtyping import Float, Int
 
 from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.filter_state import FilterState
-from madoc.calibration.least_squares.plan import FEWEST
+from madoc.calibration.least_squares.plan import FEWEST, touched
 from madoc.calibration.least_squares.predicting import Prediction
 from madoc.calibration.least_squares.search import SearchState
-from madoc.calibration.least_squares.statistics import touched
 from madoc.data import Dataset
 from madoc.identification.ensembles import likely_states
 from madoc.identification.gauss_newton import FIRST_DAMPING

@@ -21,8 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from madoc.calibration.base import CalibrationProblem
-from madoc.calibration.least_squares.plan import FEWEST
-from madoc.calibration.least_squares.statistics import touched
+from madoc.calibration.least_squares.plan import FEWEST, touched
 from madoc.calibration.least_squares.unknown_starts import UNLIKE_NOISE
 from madoc.identification.gauss_newton import FIRST_DAMPING, TRIALS, damped_step, triangle
 from madoc.identification.information import Uncertainty

@@ -8,8 +8,7 @@ from scipy.optimize import minimize_scalar
 
 from madoc.calibration.least_squares.filter_state import MEMBERS, NEAR, FilterState
 from madoc.calibration.least_squares.instruments import over_windows, surprises
-from madoc.calibration.least_squares.plan import FEWEST
-from madoc.calibration.least_squares.statistics import LONG_TAILS
+from madoc.calibration.least_squares.plan import FEWEST, LONG_TAILS
 from madoc.identification.ensembles import FilteredWindows, with_noise
 from madoc.identification.innovations import Innovations
 from madoc.identification.losses import Loss

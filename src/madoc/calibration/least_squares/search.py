@@ -13,8 +13,7 @@ from jaxtyping import Bool, Float, Int, PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.known_starts import KnownStarts
-from madoc.calibration.least_squares.plan import Outcome, Plan
-from madoc.calibration.least_squares.statistics import touched, without_contacts
+from madoc.calibration.least_squares.plan import Outcome, Plan, touched, without_contacts
 from madoc.calibration.least_squares.unknown_starts import UnknownStarts
 from madoc.identification import settling
 from madoc.identification.gauss_newton import FIRST_DAMPING, TRIALS

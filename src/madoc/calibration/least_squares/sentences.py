@@ -5,8 +5,8 @@ from jaxtyping import Float
 
 from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.filter_state import FilterState
+from madoc.calibration.least_squares.plan import EXACT, LONG_TAILS
 from madoc.calibration.least_squares.search import SearchState
-from madoc.calibration.least_squares.statistics import EXACT, LONG_TAILS
 from madoc.data import stride
 from madoc.data.velocities import dof_names
 from madoc.identification.noise import WHITE

@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from madoc.calibration.base import CalibrationProblem
-from madoc.calibration.least_squares.plan import Outcome, Plan
-from madoc.calibration.least_squares.statistics import (
+from madoc.calibration.least_squares.plan import (
+    Outcome,
+    Plan,
     autocorrelation,
     clipped_change,
     noise_ratio,

@@ -6,15 +6,15 @@ import pytest
 
 from madoc import robots, simulation
 from madoc.calibration import CalibrationProblem, LeastSquares
-from madoc.calibration.least_squares.plan import FEWEST
-from madoc.calibration.least_squares.sentences import LONG_TAILS, about_residuals, have_long_tails
-from madoc.calibration.least_squares.statistics import (
+from madoc.calibration.least_squares.plan import (
+    FEWEST,
     autocorrelation,
     clipped_change,
     consecutive_residuals,
     outlier_limits,
     without_contacts,
 )
+from madoc.calibration.least_squares.sentences import LONG_TAILS, about_residuals, have_long_tails
 from madoc.calibration.least_squares.unknown_starts import FAILED_WINDOW, LIKE_NOISE, UnknownStarts
 from madoc.data import Disturbance, disturb
 from madoc.identification.noise import alternation
