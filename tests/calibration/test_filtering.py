@@ -8,7 +8,7 @@ import pytest
 
 from madoc import robots, simulation
 from madoc.calibration import CalibrationProblem
-from madoc.calibration.least_squares import filter_state, filtering, instruments, remainder
+from madoc.calibration.least_squares import filter_state, filtering, instruments
 from madoc.calibration.least_squares.calibrator import LeastSquares
 from madoc.calibration.least_squares.filtering import of_contacts
 from madoc.calibration.least_squares.instruments import Side, agreed, axes_of
@@ -216,7 +216,7 @@ def test_an_epoch_at_rest_tells_what_half_the_ensemble_errs_and_moves_nothing(tm
     covariance = known_well.found.uncertainty.covariance  # of one gradient alone, as there was no scatter before
     np.testing.assert_allclose(covariance, np.array([[1.0, 2.0], [2.0, 4.0]]) / (1e3 * len(told)) ** 2)
     systems = filter_state.MEMBERS // 2 + 2 * 2 * len(problem.simulator.parameters) * instruments.FEW
-    large = remainder.LARGE_ROUNDS * remainder.LARGE * search.size
+    large = filtering.LARGE_ROUNDS * filtering.LARGE * search.size
     assert spent == (systems * len(search.rows) + large) * filtering.horizon_of(problem)
 
 
@@ -234,12 +234,12 @@ def test_only_what_a_larger_ensemble_loses_too_counts_as_lost(tmp_path, monkeypa
         costs[[2, 4, 5]] = 9.0, 9.0, np.inf
         return costs if len(asked) == 1 else np.array([0.5, 7.0, np.inf])
 
-    monkeypatch.setattr(remainder, "surprises", by_hand)
+    monkeypatch.setattr(filtering, "surprises", by_hand)
     (after, _), spent = counted(filtering.step, problem, rest, "cauchy")
     assert asked == [search.size, 3]
     assert after.cost == pytest.approx((0.5 * (search.size - 2) + 7.0) / (search.size - 1))
     systems = filter_state.MEMBERS // 2 + 2 * 2 * len(problem.simulator.parameters) * instruments.FEW
-    large = remainder.LARGE * (remainder.LARGE_ROUNDS * search.size + remainder.LARGER * 3)
+    large = filtering.LARGE * (filtering.LARGE_ROUNDS * search.size + filtering.LARGER * 3)
     assert spent == (systems * len(search.rows) + large) * filtering.horizon_of(problem)
 
 
@@ -301,11 +301,11 @@ def test_epochs_near_the_end_take_other_windows_and_count_together(tmp_path):
 def test_random_forces_are_likelier_only_beyond_two_standard_errors_of_enough_windows():
     """By hand: changes of -1 ± 1 in sixteen windows have a mean of -1 and a standard error of 1.03 / 4."""
     change = np.tile([0.0, -2.0], 8)
-    assert remainder.likelier(change, np.zeros(16), 2)
-    assert not remainder.likelier(change + 0.5, np.zeros(16), 2)  # -0.5 is less than twice 0.258
-    assert remainder.likelier(change + 0.45, np.zeros(16), 2)
-    assert not remainder.likelier(change, np.where(np.arange(16) < 12, np.nan, 0.0), 2)  # four windows do not tell
-    assert remainder.likelier(np.append(change, np.nan), np.zeros(17), 2)  # one that fails does not count
+    assert filtering.likelier(change, np.zeros(16), 2)
+    assert not filtering.likelier(change + 0.5, np.zeros(16), 2)  # -0.5 is less than twice 0.258
+    assert filtering.likelier(change + 0.45, np.zeros(16), 2)
+    assert not filtering.likelier(change, np.where(np.arange(16) < 12, np.nan, 0.0), 2)  # four windows do not tell
+    assert filtering.likelier(np.append(change, np.nan), np.zeros(17), 2)  # one that fails does not count
 
 
 def test_the_largest_random_force_makes_the_typical_change_of_the_speed(tmp_path):
