@@ -1,7 +1,6 @@
 """A log and a model compared before any calibration."""
 
 from madoc.diagnosis.channels import refuse_fatal
-from madoc.diagnosis.diagnosis import Diagnosis, check
-from madoc.diagnosis.words import tables, to_json
+from madoc.diagnosis.diagnosis import Diagnosis, check, tables, to_json
 
 __all__ = ["Diagnosis", "check", "refuse_fatal", "tables", "to_json"]

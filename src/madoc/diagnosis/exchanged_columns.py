@@ -58,13 +58,9 @@ def exchanged_columns(
 ) -> tuple[Finding, ...]:
     """A finding on actions or joints whose columns are exchanged or have the other sign.
 
-    Args:
-        dataset: Rows in their order, whose states are logged at least approximately.
-        simulator: The model with its calibrated parameters.
-        points: Parameters in [-1, 1]; the log as it is and the log put right are each predicted by the best of them.
-        steps: Length of the windows in control steps; shorter where no episode is as long.
-        scale: Typical change of each signal in a step.
-        contradicts: Whether the finding is to say that no estimate from this log is to be trusted.
+    The log, whose states are logged at least approximately, and the log put right are each predicted by the best of
+    the `points` in [-1, 1], over windows of so many `steps`, shorter where no episode is as long. Errors are in units
+    of `scale`. `contradicts` is whether the finding says that no estimate from this log is to be trusted.
     """
     corrections = _corrections(dataset, simulator, exchanged=True)
     affordable = MOST_STEPS // (steps * len(points))

@@ -1,6 +1,7 @@
 """How late, how strongly and in which direction each joint's acceleration follows its action, from the log alone."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -96,12 +97,8 @@ def response_findings(
 ) -> list[Finding]:
     """Findings on actions that come late, push the wrong way, or push far more or less than the model can.
 
-    Args:
-        dataset: The log.
-        simulator: The model, of which the directions and sizes are those at `points`, in [-1, 1].
-        logged: The log's states.
-        points: Where in the ranges of the parameters the model's responses are computed.
-        late_speeds: Whether logged speeds are known to come late, so that actions seem to as well.
+    Directions and sizes of the model's responses are those at the `points`, in [-1, 1]. Where logged speeds are known
+    to come late (`late_speeds`), actions seem to as well.
     """
     measured = tuple(one for one in measured_responses(dataset, simulator) if one.certain)
     if not measured:
@@ -196,9 +193,10 @@ def measured_responses(dataset: Dataset, simulator: Simulator) -> tuple[Response
     positions. Its lags come out too early where a controller computes actions from noisy readings, and wrong where
     contacts make the prediction poor. So only what both regressions tell counts.
     """
-    joints, motion = _motion(dataset, simulator)
-    if not joints:
+    driven = _motion(dataset, simulator)
+    if driven is None:
         return ()
+    joints, motion = driven
     action = np.asarray(dataset.transitions.action, np.float64)
     peaks = _peaks(motion, action[motion.rows][:, [joint.action for joint in joints]], simulator.control_step)
     windows = [np.arange(max(0, peak - _TAPS), peak + _TAPS + 1) for peak in peaks]
@@ -206,10 +204,12 @@ def measured_responses(dataset: Dataset, simulator: Simulator) -> tuple[Response
     kept = np.flatnonzero(age >= max(_EARLIER + 1, *(window[-1] for window in windows)))
     if len(kept) < _FEWEST * (motion.state.shape[1] + sum(len(window) for window in windows)):
         return ()
-    products = _products(motion, kept, action, windows, joints)
-    regressions = [_regressed(products, staged=staged) for staged in (False, True)]
+    products, scale = _products(motion, kept, action, windows, joints)
+    ends = motion.state.shape[1] + np.cumsum([0, *map(len, windows)])
+    owns = [np.arange(*each) for each in pairwise(ends)]
+    regressions = [_regressed(products, scale, owns, rows=len(kept), staged=staged) for staged in (False, True)]
     found = []
-    for at, (joint, own) in enumerate(zip(joints, products.own, strict=True)):
+    for at, (joint, own) in enumerate(zip(joints, owns, strict=True)):
         both = []
         for estimates, shares in regressions:
             taps = estimates[:, own, at]
@@ -231,13 +231,12 @@ def _smaller_first(one: float, other: float) -> tuple[float, float]:
     return (near if one * other > 0.0 else 0.0), far
 
 
-def _motion(dataset: Dataset, simulator: Simulator) -> tuple[tuple[DrivenJoint, ...], _Motion]:
-    """The joints that actions drive and whose motion is logged, and that motion."""
+def _motion(dataset: Dataset, simulator: Simulator) -> tuple[tuple[DrivenJoint, ...], _Motion] | None:
+    """The joints that actions drive and whose motion is logged, and that motion; None of none."""
     task = simulator.task
     rows = np.setdiff1d(np.arange(len(dataset)), dataset.episode_starts)
-    nothing = _Motion(rows, np.zeros((len(rows), 0)), np.zeros((len(rows), 0)), np.zeros(0))
     if task.posture is None or not len(rows):
-        return (), nothing
+        return None
     measured = task.observation_size - task.velocities  # the others were derived from positions
     logged = dataset.transitions
     now, then = (
@@ -261,7 +260,7 @@ def _motion(dataset: Dataset, simulator: Simulator) -> tuple[tuple[DrivenJoint, 
         speeds.append(speed)
         ahead.append(0.0 if seen[velocity] else 0.5)
     if not joints:
-        return (), nothing
+        return None
     angles = [now[:, joint.position] for joint in joints if joint.hinge and seen[joint.position]]
     inertial = [one * other for at, one in enumerate(speeds[:_FEW]) for other in speeds[at:_FEW]]
     functions = [*np.sign(speeds), *np.sin(angles), *np.cos(angles), *inertial]
@@ -285,37 +284,17 @@ def _peaks(motion: _Motion, action: Float[np.ndarray, "rows joints"], control_st
     return peaks
 
 
-@dataclass(frozen=True)
-class _Products:
-    """Products of the regression's columns in parts of the log, each column over its root mean square.
-
-    Attributes:
-        parts: Products of all columns in each part of the log.
-        rows: Number of rows of the log.
-        instruments: Columns of the state two rows before and of the actions.
-        design: Columns of the state and of the actions.
-        changes: Columns of the joints' changes of velocity, in their own unit.
-        own: For each joint, places of its action's rows in the design.
-        scale: Root mean square of each column of the design.
-    """
-
-    parts: Float[np.ndarray, "parts columns columns"]
-    rows: int
-    instruments: Int[np.ndarray, " terms"]
-    design: Int[np.ndarray, " terms"]
-    changes: Int[np.ndarray, " joints"]
-    own: list[Int[np.ndarray, " _"]]
-    scale: Float[np.ndarray, " terms"]
-
-
 def _products(
     motion: _Motion,
     kept: Int[np.ndarray, " some"],
     action: Float[np.ndarray, "all action"],
     windows: list[Int[np.ndarray, " _"]],
     joints: tuple[DrivenJoint, ...],
-) -> _Products:
-    """Products of earlier state, actions, state and changes over these rows of the motion, one part after the other."""
+) -> tuple[Float[np.ndarray, "parts columns columns"], Float[np.ndarray, " columns"]]:
+    """Products of earlier state, actions, state and changes over these rows of the motion, one part after the other.
+
+    Columns are over their root mean squares, which come second; those of changes are in their own unit.
+    """
 
     def columns(part: np.ndarray) -> np.ndarray:
         rows = motion.rows[part]
@@ -326,50 +305,53 @@ def _products(
     parts = np.stack([block.T @ block for block in map(columns, np.array_split(kept, _BLOCKS))])
     scale = np.sqrt(np.diagonal(parts.sum(0)) / len(kept))
     scale[scale == 0.0] = scale[-len(joints) :] = 1.0
-    parts /= scale[:, None] * scale
-    sizes, states = [len(window) for window in windows], motion.state.shape[1]
-    actions = np.arange(states, states + sum(sizes))
-    instruments, design = (np.append(first + np.arange(states), actions) for first in (0, states + sum(sizes)))
-    own = np.split(states + np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
-    changes = np.arange(len(scale) - len(joints), len(scale))
-    return _Products(parts, len(kept), instruments, design, changes, own, scale[design])
+    return parts / (scale[:, None] * scale), scale
 
 
 def _regressed(
-    products: _Products, *, staged: bool
+    products: Float[np.ndarray, "parts columns columns"],
+    scale: Float[np.ndarray, " columns"],
+    owns: list[Int[np.ndarray, " _"]],
+    *,
+    rows: int,
+    staged: bool,
 ) -> tuple[Float[np.ndarray, "estimates terms joints"], Float[np.ndarray, " joints"]]:
     """The coefficients of every joint's change, of the whole log and without each of its parts; and actions' shares.
 
     It is ordinary least squares or, if `staged`, that in two stages, of which both leave the part out: the design's
-    columns as the instruments predict them, and the changes as those predict them.
+    columns as the instruments predict them, and the changes as those predict them. The design is the state and, in the
+    places that each joint `owns`, the actions; instruments are the earlier state and the actions. Products are of so
+    many `rows`, their columns over `scale`.
     """
-    whole, count, changes = products.parts.sum(0), len(products.design), products.changes
-    targets = np.append(products.design, changes)
+    states, actions = int(owns[0][0]), np.concatenate(owns)
+    instruments, design = (np.append(first + np.arange(states), actions) for first in (0, states + len(actions)))
+    whole, count, changes = products.sum(0), len(design), np.arange(len(scale) - len(owns), len(scale))
+    targets = np.append(design, changes)
 
     def solved(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-        return np.linalg.solve(matrix + _RIDGE * products.rows * np.eye(len(matrix)), right)
+        return np.linalg.solve(matrix + _RIDGE * rows * np.eye(len(matrix)), right)
 
     def predicted(of: np.ndarray) -> np.ndarray:
         """Products of the design's columns, as the instruments predict them, with each other and with the changes."""
         if not staged:
-            return of[np.ix_(products.design, targets)]
-        mixed = of[np.ix_(products.instruments, targets)]
-        return np.asarray(mixed[:, :count].T @ solved(of[np.ix_(products.instruments, products.instruments)], mixed))
+            return of[np.ix_(design, targets)]
+        mixed = of[np.ix_(instruments, targets)]
+        return np.asarray(mixed[:, :count].T @ solved(of[np.ix_(instruments, instruments)], mixed))
 
     everything = predicted(whole)
     estimates = np.stack(
         [
             solved(each[:, :count], each[:, count:])
-            for each in (everything, *(predicted(whole - part) for part in products.parts))
+            for each in (everything, *(predicted(whole - part) for part in products))
         ]
     )
     shares = []
-    for at, own in enumerate(products.own):
+    for at, own in enumerate(owns):
         others, right = np.setdiff1d(np.arange(count), own), everything[:, count + at]
         without = solved(everything[np.ix_(others, others)], right[others])
         left = whole[changes[at], changes[at]] - np.array([right[others] @ without, right @ estimates[0, :, at]])
         shares.append(float(1.0 - left[1] / max(left[0], np.finfo(float).tiny)))
-    return estimates / products.scale[:, None], np.array(shares)
+    return estimates / scale[design, None], np.array(shares)
 
 
 def _jackknife(values: Float[np.ndarray, " estimates"]) -> float:

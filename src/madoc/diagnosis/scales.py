@@ -37,12 +37,8 @@ def scale_findings(
 ) -> list[Finding]:
     """What the scale of masses and forces, and that of positions, rests on where no log can show it.
 
-    Args:
-        dataset: The log.
-        simulator: The model.
-        logged: The log's states.
-        point: The parameters in [-1, 1] at which the scales are tried.
-        only_ratios: Whether the calibrated parameters alone can be scaled alike without a trace.
+    The scales are tried at the parameters `point` in [-1, 1]. `only_ratios` is whether the calibrated parameters alone
+    can be scaled alike without a trace.
     """
     names = [row.name for row in simulator.parameters.parameters if mass_like(row)]
     if not names:
@@ -101,14 +97,7 @@ def range_findings(dataset: Dataset, simulator: Simulator) -> list[Finding]:
 def timestep_findings(
     dataset: Dataset, simulator: Simulator, logged: LoggedStates, point: Float[np.ndarray, " d"]
 ) -> list[Finding]:
-    """A warning where a finer integration changes predictions by much.
-
-    Args:
-        dataset: The log.
-        simulator: The model.
-        logged: The log's states.
-        point: The parameters in [-1, 1] at which both are simulated.
-    """
+    """A warning where a finer integration changes predictions by much, at the parameters `point` in [-1, 1]."""
     scale = typical_change(dataset, simulator.task.attitudes)
     change = coarseness(dataset, logged, simulator, point, scale)
     if change <= COARSE:
@@ -134,16 +123,9 @@ def coarseness(
     Smooth motion hardly changes. Where contacts begin or end it may, and then parameters fitted to a machine, whose
     motion has no integration step, are not the machine's.
 
-    Args:
-        dataset: The log.
-        logged: What it says of states.
-        simulator: The model.
-        point: The parameters in [-1, 1].
-        scale: Typical change of each signal in a stride, of which the result is a multiple.
-
-    Returns:
-        The median over signals of the root mean square over windows of the log, as a signal that hardly moves may
-        change by much of its little. A window whose finer simulation fails is left out; 0 where none is left.
+    It is the median over signals, in units of `scale`, of the root mean square over windows of the log, as a signal
+    that hardly moves may change by much of its little. A window whose finer simulation fails is left out; 0 where none
+    is left. The parameters `point` are in [-1, 1].
     """
     windows = probing_windows(logged, dataset, simulator, steps=stride(dataset), count=_WINDOWS)
     finer = simulation.make(simulator.task.with_time_step(1.0 / FINER, substeps=FINER))
