@@ -170,7 +170,7 @@ def test_logs_without_contacts_fit_initial_states_and_a_horizon_of_the_users_is_
 
 
 def test_epochs_have_more_windows_where_few_touch(tmp_path, monkeypatch):
-    monkeypatch.setattr(filtering, "touched", lambda problem, states, known, rows, horizon: np.arange(len(rows)) < 8)
+    monkeypatch.setattr(filtering, "touched", lambda problem, rows, horizon: np.arange(len(rows)) < 8)
     assert of_contacts(problem_of_foot(tmp_path), jax.random.key(0)).size == 2 * filtering.BLOCK
 
 

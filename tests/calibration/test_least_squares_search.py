@@ -98,7 +98,7 @@ def test_windows_with_contacts_weigh_less_where_they_are_explained_worse(free, e
     weights = starts._relative(np.where(touching, 50.0, 1.0)[:, None] * noise)
     assert (weights[~touching] == 1.0).all()
     assert weights[touching] == pytest.approx(expected, rel=0.5)
-    assert not touched(problem, *problem.states.guesses(), rows, 1).any()  # nothing touches a spring
+    assert not touched(problem, rows, 1).any()  # nothing touches a spring
 
 
 def test_known_windows_leave_the_residuals_of_a_replay():

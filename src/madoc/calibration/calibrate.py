@@ -73,6 +73,7 @@ def calibrate(
         trace=lambda state: _trace(space, method.estimate(problem, state)),
     )
     estimate = method.estimate(problem, finished.state)
+    forces = estimate.random_forces.tolist()
     told = estimate.covariance if estimate.interval is not None else None
     warnings = (*estimate.warnings, *exploded(estimate.failures, finished.control_steps))
     if finished.status == "diverged":
@@ -95,7 +96,7 @@ def calibrate(
         settled=estimate.settled,
         unlike_noise=estimate.unlike_noise,
         effective=estimate.effective,
-        random_forces=_named(problem.simulator.task, estimate.random_forces),
+        random_forces=dict(zip(dof_names(problem.simulator.task), forces, strict=True)) if forces else {},
         group_stability=estimate.group_stability,
         problem=problem,
     )
@@ -105,11 +106,6 @@ def calibrate(
                 np.savez(stream, allow_pickle=False, names=np.array(space.names), vectors=estimate.embeddings)
         folder.write_json("result.json", result.to_json())
     return result
-
-
-def _named(task: Task, forces: Float[np.ndarray, " dof"]) -> dict[str, float]:
-    """Forces by the names of their degrees of freedom; empty where there are none."""
-    return dict(zip(dof_names(task), forces.tolist(), strict=True)) if len(forces) else {}
 
 
 def _trace(space: ParameterSpace, estimate: Estimate) -> dict[str, float]:

@@ -1,6 +1,6 @@
 """Every calibrator by the name that `madoc methods` lists."""
 
-from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from madoc.calibration.base import Calibrator
@@ -29,41 +29,16 @@ _SHOWN: dict[type, tuple[str, ...]] = {
 _MADOC = "Jiang et al., Madoc"
 
 
-def _entry(
-    name: str,
-    kind: type[Calibrator[Any]],
-    summary: str,
-    paper: str,
-    year: int,
-    settings: Mapping[str, object] | None = None,
-    recognised_by: tuple[str, ...] | None = None,
-    usual_budget: int | str = 300_000,
-) -> MethodEntry[Calibrator[Any]]:
-    simulates = kind is not Uncalibrated
-    return MethodEntry(
-        name,
-        kind,
-        summary,
-        paper,
-        year,
-        settings or {},
-        recognised_by,
-        _SHOWN[kind],
-        usual_budget=usual_budget,
-        simulates=simulates,
-    )
-
-
-_ENTRIES = (
-    _entry("madoc", Madoc, "one agent a parameter; needs no states", _MADOC, 2024),
-    _entry("madoc-s", Madoc, "one agent for all parameters", _MADOC, 2024, {"groups": "one"}),
-    _entry("madoc-vdn", Madoc, "credit by a plain sum (VDN)", _MADOC, 2024, {"mixing": "sum"}),
-    _entry("madoc-isac", Madoc, "agents share one reward, no credit", _MADOC, 2024, {"mixing": "independent"}),
-    _entry("madoc-grouped", Madoc, "one agent a group, learned by the VAE", _MADOC, 2024, {"groups": "learned"}),
-    _entry(
+_ENTRIES: tuple[MethodEntry[Calibrator[Any]], ...] = (
+    MethodEntry("madoc", Madoc, "one agent a parameter; needs no states", _MADOC, 2024),
+    MethodEntry("madoc-s", Madoc, "one agent for all parameters", _MADOC, 2024, {"groups": "one"}),
+    MethodEntry("madoc-vdn", Madoc, "credit by a plain sum (VDN)", _MADOC, 2024, {"mixing": "sum"}),
+    MethodEntry("madoc-isac", Madoc, "agents share one reward, no credit", _MADOC, 2024, {"mixing": "independent"}),
+    MethodEntry("madoc-grouped", Madoc, "one agent a group, learned by the VAE", _MADOC, 2024, {"groups": "learned"}),
+    MethodEntry(
         "madoc-paper", Madoc, "Madoc with the paper's own constants", _MADOC, 2024, PAPER, ("features", "keep_cloning")
     ),
-    _entry(
+    MethodEntry(
         "least-squares",
         LeastSquares,
         "damped Gauss-Newton, robust, with intervals",
@@ -71,9 +46,9 @@ _ENTRIES = (
         1963,
         usual_budget="300s",  # it settles by itself, mostly within seconds
     ),
-    _entry("oted", Oted, "matches (s, a) by a bandit's policy gradient", "Gur et al. (from its abstract)", 2021),
-    _entry("dropo", Dropo, "distribution that makes next states likely", "Tiboni et al., DROPO", 2022),
-    _entry(
+    MethodEntry("oted", Oted, "matches (s, a) by a bandit's policy gradient", "Gur et al. (from its abstract)", 2021),
+    MethodEntry("dropo", Dropo, "distribution that makes next states likely", "Tiboni et al., DROPO", 2022),
+    MethodEntry(
         "e-dropo",
         Dropo,
         "DROPO with an entropy bonus",
@@ -81,9 +56,9 @@ _ENTRIES = (
         2025,
         {"entropy_weight": ENTROPY_WEIGHT},
     ),
-    _entry("droid", Droid, "replayed windows, CMA-ES, its covariance", "Tsai et al., DROID", 2021),
-    _entry("cma-es", CmaEs, "one-step error, black box: a yardstick", "Hansen and Ostermeier, CMA-ES", 2001),
-    _entry(
+    MethodEntry("droid", Droid, "replayed windows, CMA-ES, its covariance", "Tsai et al., DROID", 2021),
+    MethodEntry("cma-es", CmaEs, "one-step error, black box: a yardstick", "Hansen and Ostermeier, CMA-ES", 2001),
+    MethodEntry(
         "cma-es-distribution",
         CmaEs,
         "distance of unordered observations",
@@ -91,9 +66,9 @@ _ENTRIES = (
         2026,
         {"objective": "distribution"},
     ),
-    _entry("npe", Npe, "posterior by a flow, on free rollouts", "Deistler et al., TSNPE", 2022),
-    _entry("nominal", Uncalibrated, "mid-range, uncalibrated: a yardstick", "no paper: a yardstick", 2024),
-    _entry(
+    MethodEntry("npe", Npe, "posterior by a flow, on free rollouts", "Deistler et al., TSNPE", 2022),
+    MethodEntry("nominal", Uncalibrated, "mid-range, uncalibrated: a yardstick", "no paper: a yardstick", 2024),
+    MethodEntry(
         "uniform",
         Uncalibrated,
         "the whole box as randomization",
@@ -103,4 +78,6 @@ _ENTRIES = (
     ),
 )
 
-CALIBRATORS: dict[str, MethodEntry[Calibrator[Any]]] = {entry.name: entry for entry in _ENTRIES}
+CALIBRATORS: dict[str, MethodEntry[Calibrator[Any]]] = {
+    entry.name: replace(entry, shown=_SHOWN[entry.kind], simulates=entry.kind is not Uncalibrated) for entry in _ENTRIES
+}

@@ -85,7 +85,8 @@ def check(
     if not any(finding.level == "fatal" for finding in findings):
         logged = states_of(dataset, simulator)
         idle = insensitive(simulator, *probing_rows(logged, dataset, simulator), key=of_rows)
-        findings += _insensitive_findings(idle)
+        what = "it changes nothing that is seen, from one end of its range to the other"
+        findings += [Finding("fatal", what, name, "leave it out of the spec, or widen its range") for name in idle]
         of_starts, of_draws = jax.random.split(of_box)
         draws = box_draws(len(simulator.parameters), of_draws)
         start = draws[0]
@@ -130,11 +131,6 @@ def _inexact_states_finding(logged: LoggedStates, robot: Robot | None) -> Findin
         "signals",
         "log the position and the velocity of every joint if you can",
     )
-
-
-def _insensitive_findings(names: list[str]) -> list[Finding]:
-    what = "it changes nothing that is seen, from one end of its range to the other"
-    return [Finding("fatal", what, name, "leave it out of the spec, or widen its range") for name in names]
 
 
 def to_json(diagnosis: Diagnosis, space: ParameterSpace) -> dict[str, object]:

@@ -112,9 +112,9 @@ def of_contacts(
     if min(len(rows), windows or len(rows)) < fewest:
         return None
     rows = generator(key).permutation(rows)[:MOST_SEEN]
-    if not touched(problem, *states.guesses(), rows[:FIRST_SEEN], horizon).any():
+    if not touched(problem, rows[:FIRST_SEEN], horizon).any():
         return None
-    touching = touched(problem, *states.guesses(), rows, horizon)
+    touching = touched(problem, rows, horizon)
     if touching.sum() < max(TOUCHING * len(rows), fewest):
         return None
     size = max(BLOCK, 2 * fewest) * (1 if touching.mean() >= FEW_TOUCH[1] else 2)

@@ -125,7 +125,7 @@ def lengthened(problem: CalibrationProblem, shorter: SearchState, horizon: int, 
     rows = rows[rows_that_fit(problem.dataset, rows, horizon)]
     if not len(rows):
         return None
-    free = rows[~touched(problem, *problem.states.guesses(), rows, horizon)]
+    free = rows[~touched(problem, rows, horizon)]
     chosen = evenly(free[disjoint_windows(problem.dataset, free, horizon)], max(most, fewest))
     if len(chosen) < fewest:
         return None

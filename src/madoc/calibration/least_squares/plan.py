@@ -149,13 +149,10 @@ def outlier_limits(
 
 
 def touched(
-    problem: CalibrationProblem,
-    states: Float[np.ndarray, "known state"],
-    known: Int[np.ndarray, " known"],
-    rows: Int[np.ndarray, " windows"],
-    horizon: int,
+    problem: CalibrationProblem, rows: Int[np.ndarray, " windows"], horizon: int
 ) -> Bool[np.ndarray, " windows"]:
-    """Whether bodies were in contact at any state of a window, from its first to its last, whose row is known."""
+    """Whether bodies were in contact at any state of a window, from its first to its last, that is known about."""
+    states, known = problem.states.guesses()
     ends = problem.dataset.episode_ends[problem.dataset.episode_of(rows)]
     touching = np.zeros(len(rows), dtype=bool)
     for later in range(horizon + 1):
@@ -169,7 +166,7 @@ def without_contacts(
     problem: CalibrationProblem, rows: Int[np.ndarray, " windows"], horizon: int
 ) -> Int[np.ndarray, " free"]:
     """Rows of windows in which the log shows no contact, or all where these are too few or fewer than the others."""
-    free = rows[~touched(problem, *problem.states.guesses(), rows, horizon)]
+    free = rows[~touched(problem, rows, horizon)]
     return free if len(free) >= max(FEWEST + len(problem.simulator.parameters), len(rows) / 2) else rows
 
 

@@ -142,7 +142,7 @@ def begun(problem: CalibrationProblem, state: Prediction, point: Float[np.ndarra
     is false, begin anew, and are left out if that does not help. Where the log shows contacts the fit ends at once:
     from states with errors they begin and end at other times.
     """
-    if touched(problem, *problem.states.guesses(), state.rows, steps_of_a_second(problem)).any():
+    if touched(problem, state.rows, steps_of_a_second(problem)).any():
         return replace(state, progress="no better")
     at_estimate = replace(state, progress="under way", first=point, best=point, point=point)
     if not horizon:

@@ -126,7 +126,7 @@ class Search:
             cost=np.full(self.searches, ALL_FAILED),
             moved=np.full(self.searches, 1.0 / _SMALLEST),
             rows=rows,
-            touching=touched(problem, *problem.states.guesses(), rows, self.horizon),
+            touching=touched(problem, rows, self.horizon),
             without=len(seen) - len(free),
             deviation=np.ones(problem.states.measured),
             bread=np.zeros((count, count)),
@@ -154,16 +154,19 @@ class Search:
         damping, state_damping = state.damping[:running], state.state_damping[:running, :count]
         plans = windows.plans(points, states, damping, state_damping, refining=bool(state.refining))
         outcomes = windows.outcomes(plans, states, refining=bool(state.refining))
-        roughly = self._settles_roughly(state)
+        # Windows may be trusted after one step and not after the next, and parameters then go to and fro. After many
+        # steps those of half a standard error are small enough, and the covariance counts the last as an error.
+        roughly = self.starts.unknown and bool(state.refining) and state.epochs + 1 >= self.search_epochs
         new = self._advanced(state, plans, outcomes, share=ROUGHLY_SETTLED if roughly else SETTLED)
         leader = int(np.argmin(new["cost"][:running]))
         best = plans[leader]
+        pull = best.bread @ best.steps[0]
         following = replace(
             state,
             **new,
             deviation=best.deviation,
             bread=best.bread,
-            meat=best.meat + (_of_last_step(best) if roughly and new["moved"][leader] < 1.0 else 0.0),
+            meat=best.meat + (np.outer(pull, pull) if roughly and new["moved"][leader] < 1.0 else 0.0),
             explained=int(best.kept.sum()),
             tail_cost=best.tail_cost,
             autocorrelation=best.autocorrelation,
@@ -246,14 +249,6 @@ class Search:
         columns = self.starts.settling_columns(problem) if state.waiting else self.starts.columns(problem) + tried
         return self._running(state) * self.window_count(state) * self.horizon * columns
 
-    def _settles_roughly(self, state: SearchState) -> bool:
-        """Whether steps of half a standard error are small enough: after many steps that were larger.
-
-        Windows may be trusted after one step and not after the next, and parameters then go to and fro. The covariance
-        counts the last step as an error.
-        """
-        return self.starts.unknown and bool(state.refining) and state.epochs + 1 >= self.search_epochs
-
     def _moved(self, plan: Plan, outcome: Outcome, trial: int, *, damping: float, share: float) -> float:
         """The largest component of a step relative to one that matters: a share of a standard error, or the tolerance.
 
@@ -261,13 +256,9 @@ class Search:
         may be small far from the minimum too.
         """
         tried = plan.steps[0 if damping <= self.starts.stuck else min(trial, len(TRIALS) - 1)]
-        relative = self._relative_step(plan, tried, share)
-        return max(relative, 0.0 if plan.exact else outcome.saved(trial) / LITTLE)
-
-    def _relative_step(self, plan: Plan, step: Float[np.ndarray, " d"], share: float) -> float:
-        """The largest component of a step relative to a share of its standard error, or to the tolerance."""
         error = np.sqrt(np.maximum(np.diag(sandwich(plan.bread, plan.meat).covariance), 0.0))
-        return float((np.abs(step) / np.maximum(max(2.0 * self.tolerance, _SMALLEST), share * error)).max())
+        relative = float((np.abs(tried) / np.maximum(max(2.0 * self.tolerance, _SMALLEST), share * error)).max())
+        return max(relative, 0.0 if plan.exact else outcome.saved(trial) / LITTLE)
 
     def _refined(self, state: SearchState, leader: int) -> SearchState:
         """Put the best search first, which alone goes on, to all windows."""
@@ -277,9 +268,3 @@ class Search:
             searches["damping"] = np.full(self.searches, FIRST_DAMPING)
             searches["state_damping"] = np.full_like(state.state_damping, FIRST_DAMPING)
         return replace(state, **searches, refining=1, waiting=int(self.starts.unknown), epochs=0)
-
-
-def _of_last_step(plan: Plan) -> Float[np.ndarray, "d d"]:
-    """What the least damped step adds to the scatter of the cost's gradient, where it counts as an error."""
-    pull = plan.bread @ plan.steps[0]
-    return np.outer(pull, pull)
