@@ -112,27 +112,21 @@ class CalibrationProblem:
 
 @dataclass(frozen=True)
 class Estimate:
-    """An estimate of all parameters, in physical units.
+    """An estimate of all parameters, in physical units; what is not said here is as in `CalibrationResult`.
 
     Attributes:
         mean: The estimate of each parameter.
         std: Standard deviation of each estimate.
         groups: Indices of the parameters that were calibrated together; empty means one group of all.
         failures: Number of simulated rows that diverged and were left out.
-        warnings: Reasons to doubt the estimate, one sentence each.
-        notes: How the method had initial states from the log, and why, one sentence each.
         covariance: Covariance of the estimates, with `std` squared on its diagonal; None where it is unknown.
         interval: 95 % confidence intervals, columns low and high; None where they are unknown.
         quantile: Standard errors in half of such an interval, before an end of the range cuts it off.
         settled: False where the method can tell that its search is not at its end, so that a larger budget would change
             the estimate: least squares until its steps are small, Madoc until its discriminators can have settled.
-        unlike_noise: Whether residuals have longer tails than noise has, are each like the next, or follow from state
-            and action: the model does not explain the log, and the intervals do not count that. False where the method
-            does not estimate the noise.
-        effective: Whether the model leaves more than noise, and the estimate is the one that predicts best with it.
-        random_forces: Standard deviation of random forces on each degree of freedom of the model, in its order, in N or
-            N·m, new ones in each control step, that act on the machine besides; empty where none were found
-            that are random.
+        unlike_noise: Whether the model does not explain the log, which the intervals do not count. False where the
+            method does not estimate the noise.
+        random_forces: By degree of freedom of the model, in its order; empty where none were found that are random.
         group_stability: Mean adjusted Rand index of the groups with those found from resampled states, or proposed in
             other epochs; 1 is the same groups, 0 chance. None where groups were not found from the problem.
         embeddings: One vector for each parameter, close together for those that act alike; None where none was learnt.

@@ -172,30 +172,24 @@ class CalibrationResult:
         """The parameters as a rich table, with intervals and errors where they are known."""
         title = f"{self.method} on {self.task}"
         table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=(0, 0), pad_edge=False)
-        group_of = {name: index for index, names in enumerate(self.groups, 1) for name in names}
-        table.add_column("parameter", min_width=max(map(len, self.parameters)))
-        table.add_column("unit")
-        given = any(row.given is not None for row in self.parameters.values())
-        if given:
-            table.add_column("as given", justify="right")
-        intervals = any(row.interval for row in self.parameters.values())
-        headings = ["estimate ± std", *(["95 %"] if intervals else []), "range", *(["group"] if self.grouped else [])]
-        for heading in headings:
-            table.add_column(heading, justify="right")
+        names, rows = list(self.parameters), list(self.parameters.values())
+        group_of = {name: str(index) for index, group in enumerate(self.groups, 1) for name in group}
         errors = self.error["per_parameter"] if self.error else {}
-        if errors:
-            table.add_column("error", justify="right")
-        for name, row in self.parameters.items():
-            cells = [
-                name,
-                row.unit,
-                *(["" if row.given is None else f"{row.given:.4g}"] if given else []),
-                f"{row.estimate:.4g} ± {row.std:.2g}",
-                *([_span(row.interval)] if intervals else []),
-                f"[{row.low:g}, {row.high:g}]",
-                *([str(group_of[name])] if self.grouped else []),
-            ]
-            table.add_row(*cells, *([f"{errors[name]:.2g}"] if errors else []))
+        numbers = {
+            "as given": ["" if row.given is None else f"{row.given:.4g}" for row in rows],
+            "estimate ± std": [f"{row.estimate:.4g} ± {row.std:.2g}" for row in rows],
+            "95 %": [_span(row.interval) for row in rows],
+            "range": [f"[{row.low:g}, {row.high:g}]" for row in rows],
+            "group": [group_of[name] if self.grouped else "" for name in names],
+            "error": [f"{errors[name]:.2g}" if errors else "" for name in names],
+        }
+        shown = {heading: cells for heading, cells in numbers.items() if any(cells)}
+        table.add_column("parameter", min_width=max(map(len, names)))
+        table.add_column("unit")
+        for heading in shown:
+            table.add_column(heading, justify="right")
+        for name, row, *cells in zip(names, rows, *shown.values(), strict=True):
+            table.add_row(name, row.unit, *cells)
         return table
 
     def predictions(self) -> Table | None:

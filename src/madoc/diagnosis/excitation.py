@@ -127,14 +127,9 @@ def _excited(
     more = max(1.0, available / len(best.residuals))  # windows of the whole log for each of these
     certainty = sandwich(more * bread(best, 1.0, "linear"), more * meat(best, 1.0, "linear"))
     noise = max(float(np.sqrt((best.residuals**2).mean())), np.finfo(float).tiny)
-    certainty, only_ratios = _without_scale(certainty, best, point, space)
-    return Excitation(
-        effect=np.sqrt((best.jacobian**2).mean((0, 1))) / noise,
-        half_width=(space.high - space.low) / 2.0 * half_width(certainty.covariance, available),
-        pairs=tuple(correlated_pairs(certainty.correlation, space.names)),
-        sentences=identifiability(certainty, space.names),
-        only_ratios=only_ratios,
-    )
+    effect = np.sqrt((best.jacobian**2).mean((0, 1))) / noise
+    half = (space.high - space.low) / 2.0 * half_width(certainty.covariance, available)
+    return _excitation(effect, half, certainty, best, point, space)
 
 
 def excite_unknown(dataset: Dataset, simulator: Simulator, logged: LoggedStates, *, intervals: bool) -> Excitation:
@@ -151,7 +146,6 @@ def excite_unknown(dataset: Dataset, simulator: Simulator, logged: LoggedStates,
     scale = typical_change(dataset, simulator.task.attitudes)
     around = linearise(points, window_residuals(simulator, windows, points, scale))
     certainty = sandwich(bread(around, 1.0, "linear"), np.zeros((len(space), len(space))))
-    certainty, only_ratios = _without_scale(certainty, around, middle, space)
     effect = half = np.full(len(space), np.nan)
     if intervals and logged.kind == "approximate":
         fitted = windows_of(dataset, logged, scale, fewest=FEWEST + len(space), most=FEWEST + len(space))
@@ -163,26 +157,27 @@ def excite_unknown(dataset: Dataset, simulator: Simulator, logged: LoggedStates,
             half = half * (space.high - space.low) / 2.0
             seen = fit.slopes.over(np.tile(noise, fitted.readings.steps + 1)).by_parameters[fit.counted]
             effect = np.sqrt((seen**2).mean((0, 1)))
-    return Excitation(
-        effect=effect,
-        half_width=half,
-        pairs=tuple(correlated_pairs(certainty.correlation, space.names)),
-        sentences=identifiability(certainty, space.names),
-        only_ratios=only_ratios,
-    )
+    return _excitation(effect, half, certainty, around, middle, space)
 
 
-def _without_scale(
-    certainty: Uncertainty, around: Linearisation, point: Float[np.ndarray, " d"], space: ParameterSpace
-) -> tuple[Uncertainty, bool]:
-    """Whether scaling all calibrated masses and forces alike changes no residual; if so, without that direction."""
+def _excitation(
+    effect: Float[np.ndarray, " d"],
+    half: Float[np.ndarray, " d"],
+    certainty: Uncertainty,
+    around: Linearisation,
+    point: Float[np.ndarray, " d"],
+    space: ParameterSpace,
+) -> Excitation:
+    """What a certainty says; if scaling all masses and forces alike changes no residual, without that direction."""
     scaled = np.array([mass_like(row) for row in space.parameters])
     direction = np.where(scaled, space.to_physical(point) / (0.5 * (space.high - space.low)), 0.0)
     parts = around.jacobian * direction
-    if (parts.sum(-1) ** 2).sum() >= HIDDEN**2 * (parts**2).sum():
-        return certainty, False
-    along = certainty.unidentified @ direction / np.linalg.norm(direction)
-    return replace(certainty, unidentified=certainty.unidentified[np.abs(along) < ALIGNED]), True
+    only_ratios = not (parts.sum(-1) ** 2).sum() >= HIDDEN**2 * (parts**2).sum()
+    if only_ratios:
+        along = certainty.unidentified @ direction / np.linalg.norm(direction)
+        certainty = replace(certainty, unidentified=certainty.unidentified[np.abs(along) < ALIGNED])
+    pairs = tuple(correlated_pairs(certainty.correlation, space.names))
+    return Excitation(effect, half, pairs, identifiability(certainty, space.names), only_ratios)
 
 
 def excitation_findings(excitation: Excitation, simulator: Simulator) -> list[Finding]:
