@@ -76,19 +76,9 @@ class KnownStarts:
         return rows
 
     @staticmethod
-    def columns(problem: CalibrationProblem) -> int:
-        """Number of systems simulated for the derivatives of an epoch: central differences."""
-        return 1 + 2 * len(problem.simulator.parameters)
-
-    @staticmethod
-    def trial_columns(*, refining: bool) -> int:
-        """Number of systems simulated for the steps tried in an epoch."""
-        return len(TRIALS)
-
-    @staticmethod
-    def settling_columns(problem: CalibrationProblem) -> int:
-        """None, as initial states are known."""
-        return 0
+    def systems(problem: CalibrationProblem, *, refining: bool, waiting: bool) -> int:
+        """Number of systems simulated in an epoch: central differences, and the steps tried."""
+        return 1 + 2 * len(problem.simulator.parameters) + len(TRIALS)
 
     def plans(
         self,

@@ -207,7 +207,9 @@ class Search:
 
     def _settled_states(self, windows: UnknownStarts, state: SearchState) -> tuple[SearchState, Epoch]:
         """One step of initial states alone, which every search on new windows begins with."""
-        after = windows.settle(state.point[0], state.states[0], state.state_damping[0])
+        width = np.zeros(len(windows.readings.spread))
+        given = state.point[0], state.states[0], state.state_damping[0], width
+        after = settling.settle(windows.simulator, windows.readings, *given, windows.loss)
         new_states, new_damping = state.states.copy(), state.state_damping.copy()
         new_states[0], new_damping[0] = after.states, after.damping
         following = replace(
@@ -245,9 +247,8 @@ class Search:
 
     def epoch_steps(self, problem: CalibrationProblem, state: SearchState) -> int:
         """About how many control steps an epoch simulates."""
-        tried = self.starts.trial_columns(refining=bool(state.refining))
-        columns = self.starts.settling_columns(problem) if state.waiting else self.starts.columns(problem) + tried
-        return self._running(state) * self.window_count(state) * self.horizon * columns
+        systems = self.starts.systems(problem, refining=bool(state.refining), waiting=bool(state.waiting))
+        return self._running(state) * self.window_count(state) * self.horizon * systems
 
     def _moved(self, plan: Plan, outcome: Outcome, trial: int, *, damping: float, share: float) -> float:
         """The largest component of a step relative to one that matters: a share of a standard error, or the tolerance.

@@ -25,7 +25,7 @@ from madoc.identification.linearisation import WindowSlopes
 from madoc.identification.losses import TUNING, Loss, curvature_share, loss_slope
 from madoc.identification.noise import channel_noise
 from madoc.identification.replay import Readings, slopes_at
-from madoc.identification.settling import FAILED_WINDOW, Settled, settle, window_costs
+from madoc.identification.settling import FAILED_WINDOW, window_costs
 from madoc.identification.windows import disjoint_windows
 from madoc.simulation.base import Simulator
 
@@ -96,30 +96,15 @@ class UnknownStarts:
         return rows
 
     @staticmethod
-    def columns(problem: CalibrationProblem) -> int:
-        """Number of systems simulated for the derivatives of an epoch: differences by parameters and states."""
-        return 1 + len(problem.simulator.parameters) + problem.states.physical_size
+    def systems(problem: CalibrationProblem, *, refining: bool, waiting: bool) -> int:
+        """Number of systems simulated in an epoch: differences by parameters and states, and the steps tried.
 
-    @staticmethod
-    def trial_columns(*, refining: bool) -> int:
-        """Number of systems simulated for the steps tried in an epoch; while it refines the first mostly serves."""
-        return 1 if refining else len(FOLLOWED) * (len(TRIALS) + 1)
-
-    @staticmethod
-    def settling_columns(problem: CalibrationProblem) -> int:
-        """How many systems are simulated in an epoch in which only initial states move."""
-        return 4 + problem.states.physical_size
-
-    def settle(
-        self,
-        point: Float[np.ndarray, " d"],
-        states: Float[np.ndarray, "windows state"],
-        damping: Float[np.ndarray, " windows"],
-    ) -> Settled:
-        """One step of the initial states alone."""
-        return settle(
-            self.simulator, self.readings, point, states, damping, np.zeros(len(self.readings.spread)), self.loss
-        )
+        While it refines the first step mostly serves. If it is `waiting`, only initial states move.
+        """
+        size = problem.states.physical_size
+        if waiting:
+            return 4 + size
+        return 1 + len(problem.simulator.parameters) + size + (1 if refining else len(FOLLOWED) * (len(TRIALS) + 1))
 
     def plans(
         self,
