@@ -8,7 +8,7 @@ import pytest
 
 from madoc import robots, simulation
 from madoc.calibration import CalibrationProblem
-from madoc.calibration.least_squares import filter_state, filtering, instruments
+from madoc.calibration.least_squares import filtering, instruments
 from madoc.calibration.least_squares.calibrator import LeastSquares
 from madoc.calibration.least_squares.filtering import of_contacts
 from madoc.calibration.least_squares.instruments import Side, agreed, axes_of
@@ -206,8 +206,8 @@ def test_an_epoch_at_rest_tells_what_half_the_ensemble_errs_and_moves_nothing(tm
     assert (search.blocks, len(search.rows)) == (1, 42)
     told = np.broadcast_to(np.eye(2), (len(search.rows), 2, 2))
     truth = problem.simulator.parameters.to_unit(problem.simulator.parameters.vector(FOOT_TRUTH))
-    rest = replace(search, point=truth, wide=3, quiet=1, together=filter_state.TOGETHER, squares=told)
-    assert rest.at_rest and not rest.settled and rest.members == filter_state.MEMBERS // 2
+    rest = replace(search, point=truth, wide=3, quiet=1, together=instruments.TOGETHER, squares=told)
+    assert rest.at_rest and not rest.settled and rest.members == instruments.MEMBERS // 2
     (after, _), spent = counted(filtering.step, problem, rest, "cauchy")
     assert after.settled
     np.testing.assert_array_equal(after.point, rest.point)
@@ -215,7 +215,7 @@ def test_an_epoch_at_rest_tells_what_half_the_ensemble_errs_and_moves_nothing(tm
     known_well = replace(after, apart=np.array([1.0, 2.0]), compared=0, products=1e3 * told, squares=1e3 * told)
     covariance = known_well.found.uncertainty.covariance  # of one gradient alone, as there was no scatter before
     np.testing.assert_allclose(covariance, np.array([[1.0, 2.0], [2.0, 4.0]]) / (1e3 * len(told)) ** 2)
-    systems = filter_state.MEMBERS // 2 + 2 * 2 * len(problem.simulator.parameters) * instruments.FEW
+    systems = instruments.MEMBERS // 2 + 2 * 2 * len(problem.simulator.parameters) * instruments.FEW
     large = filtering.LARGE_ROUNDS * filtering.LARGE * search.size
     assert spent == (systems * len(search.rows) + large) * filtering.horizon_of(problem)
 
@@ -224,7 +224,7 @@ def test_only_what_a_larger_ensemble_loses_too_counts_as_lost(tmp_path, monkeypa
     problem = problem_of_foot(tmp_path)
     search = of_contacts(problem, jax.random.key(0))
     told = np.broadcast_to(np.eye(2), (len(search.rows), 2, 2))
-    rest = replace(search, wide=3, quiet=1, together=filter_state.TOGETHER, squares=told)
+    rest = replace(search, wide=3, quiet=1, together=instruments.TOGETHER, squares=told)
     asked = []
 
     def by_hand(found, loss):
@@ -238,7 +238,7 @@ def test_only_what_a_larger_ensemble_loses_too_counts_as_lost(tmp_path, monkeypa
     (after, _), spent = counted(filtering.step, problem, rest, "cauchy")
     assert asked == [search.size, 3]
     assert after.cost == pytest.approx((0.5 * (search.size - 2) + 7.0) / (search.size - 1))
-    systems = filter_state.MEMBERS // 2 + 2 * 2 * len(problem.simulator.parameters) * instruments.FEW
+    systems = instruments.MEMBERS // 2 + 2 * 2 * len(problem.simulator.parameters) * instruments.FEW
     large = filtering.LARGE * (filtering.LARGE_ROUNDS * search.size + filtering.LARGER * 3)
     assert spent == (systems * len(search.rows) + large) * filtering.horizon_of(problem)
 
@@ -250,7 +250,7 @@ def test_random_forces_are_asked_for_at_the_end_and_found(tmp_path):
     told = np.broadcast_to(np.eye(2), (len(search.rows), 2, 2))
     truth = problem.simulator.parameters.to_unit(problem.simulator.parameters.vector(FOOT_TRUTH))
     search = replace(search, point=truth, noise=np.array([*NOISE.values()]) / problem.typical_change)
-    rest = replace(search, wide=3, quiet=1, together=filter_state.TOGETHER, squares=told, halved=9)
+    rest = replace(search, wide=3, quiet=1, together=instruments.TOGETHER, squares=told, halved=9)
     state = back_to_filter(LeastSquaresState(None, (), "filtering", rest, None))
     assert state.filtered.asked == "trial" and not state.filtered.settled and not state.finished
     exact = replace(state.filtered, asked="exact", cost=2.0)  # before a search from fitted starts has had its steps
@@ -260,7 +260,7 @@ def test_random_forces_are_asked_for_at_the_end_and_found(tmp_path):
     (found, _), spent = counted(filtering.step, problem, tried, "cauchy")
     assert spent == filtering.epoch_steps(problem, tried)
     assert found.force == pytest.approx(0.4, rel=0.25) and not found.settled
-    done = replace(found, together=filter_state.TOGETHER, moved=0.0, quiet=1, halved=9, squares=told, alike=0.9)
+    done = replace(found, together=instruments.TOGETHER, moved=0.0, quiet=1, halved=9, squares=told, alike=0.9)
     assert done.settled and back_to_filter(replace(state, filtered=done)).finished  # they are looked for once
     np.testing.assert_allclose(random_forces.by_dof(problem.simulator, found.force), found.force * np.ones(2))
     (warning,) = about_surprises(problem, replace(done, alike=0.0))
@@ -292,8 +292,8 @@ def test_epochs_near_the_end_take_other_windows_and_count_together(tmp_path):
     assert replace(near, quiet=1, moved=0.5).block == slice(64, None)
     kept, fresh = np.arange(6.0), np.array([9.0, 9.0])
     np.testing.assert_allclose(filtering._counted(kept, fresh, slice(2, 4), 2), [0.0, 1.0, 5.5, 6.0, 4.0, 5.0])
-    assert replace(near, quiet=1, together=5, moved=0.99 * filter_state.NEAR).near  # what one of them says counts less
-    far = replace(near, quiet=1, moved=filter_state.NEAR)
+    assert replace(near, quiet=1, together=5, moved=0.99 * instruments.NEAR).near  # what one of them says counts less
+    far = replace(near, quiet=1, moved=instruments.NEAR)
     fresh_start, _ = filtering.step(problem, far, "cauchy")
     assert fresh_start.together == 0 and not fresh_start.gradients[32:].any()
 

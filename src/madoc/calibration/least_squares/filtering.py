@@ -15,9 +15,12 @@ from jaxtyping import Float, PRNGKeyArray
 from scipy.optimize import minimize_scalar
 
 from madoc.calibration.base import CalibrationProblem
-from madoc.calibration.least_squares.filter_state import LIKE_CHANCE, MEMBERS, NEAR, FilterState
 from madoc.calibration.least_squares.instruments import (
     FEW,
+    LIKE_CHANCE,
+    MEMBERS,
+    NEAR,
+    FilterState,
     Side,
     agreed,
     axes_of,

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from madoc.calibration.base import CalibrationProblem
-from madoc.calibration.least_squares.filter_state import FilterState
+from madoc.calibration.least_squares.instruments import FilterState
 from madoc.calibration.least_squares.plan import FEWEST, touched
 from madoc.calibration.least_squares.predicting import Prediction
 from madoc.calibration.least_squares.search import SearchState

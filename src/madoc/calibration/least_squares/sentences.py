@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 
 from madoc.calibration.base import CalibrationProblem
-from madoc.calibration.least_squares.filter_state import FilterState
+from madoc.calibration.least_squares.instruments import FilterState
 from madoc.calibration.least_squares.plan import EXACT, LONG_TAILS
 from madoc.calibration.least_squares.search import SearchState
 from madoc.data import stride
