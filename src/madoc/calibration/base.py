@@ -136,8 +136,8 @@ class Estimate:
     std: Float[np.ndarray, " d"]
     groups: tuple[tuple[int, ...], ...] = ()
     failures: int = 0
-    warnings: tuple[str, ...] = field(default=())
-    notes: tuple[str, ...] = field(default=())
+    warnings: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     covariance: Float[np.ndarray, "d d"] | None = None
     interval: Float[np.ndarray, "d 2"] | None = None
     quantile: float = NORMAL_95

@@ -75,9 +75,12 @@ def calibrate(
     estimate = method.estimate(problem, finished.state)
     forces = estimate.random_forces.tolist()
     told = estimate.covariance if estimate.interval is not None else None
-    warnings = (*estimate.warnings, *exploded(estimate.failures, finished.control_steps))
-    if finished.status == "diverged":
-        warnings = (DIVERGED, *warnings)
+    warnings = [*([DIVERGED] if finished.status == "diverged" else ()), *estimate.warnings]
+    if estimate.failures:
+        warnings.append(
+            f"{estimate.failures:,} simulated rows or windows exploded, in {finished.control_steps:,} control steps, "
+            "and were left out; the ranges may hold impossible parameters"
+        )
     result = CalibrationResult(
         method=entry.name,
         task=problem.simulator.task.name,
@@ -130,16 +133,6 @@ def _given(task: Task, parameter: Parameter) -> float | None:
     """The value in the user's own model as it was given; None where its elements differ, or the model is Madoc's."""
     values = set(nominal_values(task.model, parameter)) if task.source is not None else set()
     return values.pop() if len(values) == 1 else None
-
-
-def exploded(failures: int, control_steps: int) -> tuple[str, ...]:
-    """Warn of simulated rows, or windows of them, that diverged, if any did."""
-    if not failures:
-        return ()
-    return (
-        f"{failures:,} simulated rows or windows exploded, in {control_steps:,} control steps, and were left out; "
-        "the ranges may hold impossible parameters",
-    )
 
 
 def without_repeats(warnings: Iterable[str], doubts: Iterable[str]) -> list[str]:

@@ -82,8 +82,12 @@ def speed_findings(dataset: Dataset, simulator: Simulator) -> tuple[list[Finding
     findings, fits = _compared(pairs, simulator.control_step)
     if fits and 2 * len(fits) >= len(pairs):
         findings += _rate_findings(fits)
-    late = [pair_and_fit for pair_and_fit in fits if pair_and_fit[1].late]
-    return [*findings, *(_late_finding(*each) for each in late)], bool(late)
+    late = [(pair, fit) for pair, fit in fits if fit.late]
+    for pair, fit in late:
+        what = f"it comes {fit.lag:.2g} ± {2.0 * fit.lag_error:.1g} s after the change of {pair.position}"
+        remedy = "a filter or a driver delays it: log the raw speed, or leave its signal out of the spec"
+        findings.append(Finding("warning", what, pair.speed, remedy))
+    return findings, bool(late)
 
 
 def _compared(pairs: list[_Pair], control_step: float) -> tuple[list[Finding], list[tuple[_Pair, "_Fit"]]]:
@@ -98,7 +102,10 @@ def _compared(pairs: list[_Pair], control_step: float) -> tuple[list[Finding], l
             findings.append(Finding("warning", what, pair.position, "unwrap the angle where it is logged"))
         ratio = _ratio(pair.change[~turned], pair.expected[~turned])
         if ratio is not None and not _NEAR[0] < ratio < _NEAR[1]:
-            findings.append(_unit_finding(pair, ratio))
+            mistake = unit_mistake(ratio)
+            what = f"it changes {ratio:.3g} times as fast as {pair.speed} says" + (f": {mistake}?" if mistake else "")
+            remedy = "look at units and signs in the spec and at control_step"
+            findings.append(Finding("warning", what, pair.position, remedy, True))
         elif ratio is not None and not turned.any():
             fit = _fitted(pair, control_step)
             fits += [] if fit is None else [(pair, fit)]
@@ -187,12 +194,6 @@ def unit_mistake(ratio: float) -> str:
     return next((text for factor, text in factors if abs(ratio / factor - 1.0) < 0.1), "")
 
 
-def _unit_finding(pair: _Pair, ratio: float) -> Finding:
-    mistake = unit_mistake(ratio)
-    what = f"it changes {ratio:.3g} times as fast as {pair.speed} says" + (f": {mistake}?" if mistake else "")
-    return Finding("warning", what, pair.position, "look at units and signs in the spec and at control_step", True)
-
-
 @dataclass(frozen=True)
 class _Fit:
     """The change of a position by the speed, each number with its standard error.
@@ -279,12 +280,6 @@ def _rate_findings(fits: list[tuple[_Pair, _Fit]]) -> list[Finding]:
 
 def _one_side(values: list[float]) -> bool:
     return min(values) > 0.0 or max(values) < 0.0
-
-
-def _late_finding(pair: _Pair, fit: _Fit) -> Finding:
-    what = f"it comes {fit.lag:.2g} ± {2.0 * fit.lag_error:.1g} s after the change of {pair.position}"
-    remedy = "a filter or a driver delays it: log the raw speed, or leave its signal out of the spec"
-    return Finding("warning", what, pair.speed, remedy)
 
 
 def _stretches(pair: _Pair, rows: int) -> Float[np.ndarray, "stretches 5"]:

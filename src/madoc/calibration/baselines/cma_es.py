@@ -140,7 +140,7 @@ class Clouds:
     of_observations: CosineFeatures
     pair: Float[np.ndarray, " features"]
     change: Float[np.ndarray, " features"]
-    read: int
+    read: int = 0
 
 
 @jax.tree_util.register_dataclass
@@ -222,7 +222,7 @@ class CmaEs:
         search = Evolution.about(np.zeros(len(problem.simulator.parameters)))
         clouds = None if self.objective == "one-step" else self._begin_clouds(problem, of_features)
         actor = self._begin_actor(problem, of_actor) if acts else None
-        return CmaEsState(SearchState(search, key, 0), clouds, actor)
+        return CmaEsState(SearchState(search, key), clouds, actor)
 
     def step(self, problem: CalibrationProblem, state: CmaEsState) -> tuple[CmaEsState, Epoch]:
         """One generation. Before the first there are epochs of cloning, and one in which the log is read."""
@@ -234,7 +234,9 @@ class CmaEs:
         of_candidates, of_rows, key = jax.random.split(inner.key, 3)
         candidates = inner.search.ask(of_candidates, self.population)
         if clouds is None:
-            costs, spent, failures = self._one_step(problem, candidates, of_rows)
+            residuals = replay_residuals(problem, candidates, of_rows, steps=1, windows=self.rows or ROWS["one-step"])
+            squared = (residuals**2).mean(-1)
+            costs, spent, failures = mean_with_failures(squared), squared.size, int(np.isnan(squared).sum())
         elif actor is None:
             costs, spent, failures = self._replay(problem, clouds, candidates, of_rows)
         else:
@@ -267,7 +269,6 @@ class CmaEs:
             of_observations=cosine_features(of_observations, size, self.features),
             pair=nothing,
             change=nothing,
-            read=0,
         )
 
     def _begin_actor(self, problem: CalibrationProblem, key: PRNGKeyArray) -> Actor:
@@ -316,11 +317,6 @@ class CmaEs:
         else:
             pairs = self._standardised(problem, np.concatenate([rows.observation, rows.action], axis=-1))
         return replace(clouds, pair=clouds.of_pairs.mean(pairs), change=after - before, read=1)
-
-    def _one_step(self, problem: CalibrationProblem, candidates: Candidates, key: PRNGKeyArray) -> Evaluation:
-        residuals = replay_residuals(problem, candidates, key, steps=1, windows=self.rows or ROWS["one-step"])
-        squared = (residuals**2).mean(-1)
-        return mean_with_failures(squared), squared.size, int(np.isnan(squared).sum())
 
     def _replay(
         self, problem: CalibrationProblem, clouds: Clouds, candidates: Candidates, key: PRNGKeyArray

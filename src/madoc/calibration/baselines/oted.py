@@ -189,7 +189,7 @@ class OtedState:
     distribution: Distribution
     average: Distribution
     key: PRNGKeyArray
-    failures: int
+    failures: int = 0
 
 
 @dataclass(frozen=True)
@@ -268,7 +268,6 @@ class Oted:
             distribution=distribution,
             average=distribution,
             key=key,
-            failures=0,
         )
 
     def step(self, problem: CalibrationProblem, state: OtedState) -> tuple[OtedState, Epoch]:

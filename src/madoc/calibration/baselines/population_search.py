@@ -122,7 +122,7 @@ class SearchState:
 
     search: Evolution
     key: PRNGKeyArray
-    failures: int
+    failures: int = 0
 
 
 def begin_search(
@@ -135,7 +135,7 @@ def begin_search(
     """
     problem.require_pairs()
     first_rows(problem.dataset, problem.states.exact()[1], steps)
-    return SearchState(Evolution.about(np.zeros(dimensions or len(problem.simulator.parameters))), key, 0)
+    return SearchState(Evolution.about(np.zeros(dimensions or len(problem.simulator.parameters))), key)
 
 
 def draw_windows(problem: CalibrationProblem, steps: int, count: int, key: PRNGKeyArray) -> Windows:

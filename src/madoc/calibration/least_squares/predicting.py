@@ -93,8 +93,8 @@ class Prediction:
     error: float
     damping: float
     covariance: Float[np.ndarray, "d d"]
-    epochs: int
-    rounds: int
+    epochs: int = 0
+    rounds: int = 0
 
     def of_both(self, other: Uncertainty) -> Uncertainty:
         """The other's uncertainty with this one's, and with the distance of the two as an error of its own."""
@@ -130,8 +130,6 @@ def windows_for(problem: CalibrationProblem) -> Prediction | None:
         error=0.0,
         damping=FIRST_DAMPING,
         covariance=np.zeros((count, count)),
-        epochs=0,
-        rounds=0,
     )
 
 

@@ -73,13 +73,13 @@ class SearchState:
     deviation: Float[np.ndarray, " channels"]
     bread: Float[np.ndarray, "d d"]
     meat: Float[np.ndarray, "d d"]
-    explained: int
-    tail_cost: float
-    autocorrelation: float
-    refining: int
-    waiting: int
-    epochs: int
-    failures: int
+    explained: int = 0
+    tail_cost: float = 0.0
+    autocorrelation: float = 0.0
+    refining: int = 0
+    waiting: int = 0
+    epochs: int = 0
+    failures: int = 0
 
 
 _OF_EACH_SEARCH = ("point", "states", "damping", "state_damping", "cost", "moved")
@@ -131,13 +131,6 @@ class Search:
             deviation=np.ones(problem.states.measured),
             bread=np.zeros((count, count)),
             meat=np.zeros((count, count)),
-            explained=0,
-            tail_cost=0.0,
-            autocorrelation=0.0,
-            refining=0,
-            waiting=0,
-            epochs=0,
-            failures=0,
         )
 
     def step(self, problem: CalibrationProblem, state: SearchState) -> tuple[SearchState, Epoch]:

@@ -162,8 +162,6 @@ class Madoc:
             walkers=begin_freely(problem, length, of_start, systems=systems, rows=collection.rows(systems)),
             watch=watch.Watch(agents.average),
             key=key,
-            grouped=0,
-            failures=0,
         )
 
     def step(self, problem: CalibrationProblem, state: MadocState) -> tuple[MadocState, Epoch]:

@@ -138,5 +138,5 @@ class MadocState:
     walkers: Walkers
     watch: Watch
     key: PRNGKeyArray
-    grouped: int
-    failures: int
+    grouped: int = 0
+    failures: int = 0

@@ -97,7 +97,7 @@ class NpeState:
     high: Float[np.ndarray, " d"]
     belief: Belief
     key: PRNGKeyArray
-    failures: int
+    failures: int = 0
 
 
 @dataclass(frozen=True)
@@ -184,7 +184,6 @@ class Npe:
             high=box,
             belief=prior_belief(count),
             key=key,
-            failures=0,
         )
 
     def step(self, problem: CalibrationProblem, state: NpeState) -> tuple[NpeState, Epoch]:
