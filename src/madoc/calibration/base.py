@@ -115,8 +115,6 @@ class Estimate:
     """An estimate of all parameters, in physical units; what is not said here is as in `CalibrationResult`.
 
     Attributes:
-        mean: The estimate of each parameter.
-        std: Standard deviation of each estimate.
         groups: Indices of the parameters that were calibrated together; empty means one group of all.
         failures: Number of simulated rows that diverged and were left out.
         covariance: Covariance of the estimates, with `std` squared on its diagonal; None where it is unknown.

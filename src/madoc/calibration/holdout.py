@@ -223,11 +223,7 @@ class Judged:
 
 @dataclass(frozen=True, kw_only=True)
 class JudgedByErrors(Judged):
-    """The fields of the two records of prediction errors.
-
-    Attributes:
-        errors: The prediction errors.
-    """
+    """The fields of the two records of prediction errors."""
 
     errors: PredictionErrors
 

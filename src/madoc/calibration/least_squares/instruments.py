@@ -238,7 +238,6 @@ class FilterState:
         quiet: 1 once noise, its mean over epochs that count together, has not changed much from one epoch to the next.
         halved: Number of blocks of windows compared with what half as many states tell.
         together: Number of epochs near the end that the last step was by, 0 before these.
-        epochs: Number of epochs.
         failures: Number of windows whose simulation failed.
         force: Size of random forces in N/√kg (`random_forces`), 0 until these are looked for.
         asked: What is asked once the search has settled, and `nothing` before: whether a search from fitted starts

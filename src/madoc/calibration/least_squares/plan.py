@@ -80,7 +80,6 @@ class Found:
 
     Attributes:
         point: The parameters, in [-1, 1].
-        uncertainty: That of the point.
         windows: Number of independent windows that tell it.
         settled: Whether the search has come to its end.
         unlike_noise: Whether residuals have longer tails than noise has, are each like the next, or follow from state

@@ -46,11 +46,9 @@ class UnknownStarts:
     """Windows whose initial states are unknowns besides the parameters; the first reading is a reading like the others.
 
     Attributes:
-        simulator: The simulator.
         readings: Actions and observations of the windows.
         rounding: Deviation of the rounding of counts in typical changes of each channel.
         loss: Loss of residuals in standard deviations of the noise.
-        unknown: Whether initial states are unknown.
         failed_cost: Cost at which every window fails.
         stuck: Damping at which steps are so short that their length no longer shows how far the minimum is.
     """

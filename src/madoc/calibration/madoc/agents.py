@@ -159,7 +159,6 @@ class Agents:
         prior: The p of Eq. (13): a moving average of the actors.
         average: Moving average of the actors from which the estimate is read.
         log_blur: Logarithm of the deviation of the noise on s' features that both discriminators see.
-        updates: Number of updates so far.
     """
 
     discriminators: Discriminators

@@ -35,7 +35,6 @@ class Collection:
     """Madoc's choices about simulated rows, made for one problem.
 
     Attributes:
-        problem: Data and simulator.
         systems: Number of parameter draws in an epoch.
         steps: Control steps of each row under one draw.
         epoch_steps: Control steps in an epoch, of all rows together, as far as they go into as many rows for each draw;
@@ -119,11 +118,9 @@ class MadocState:
         noise: Standard deviation of the noise that simulated observations are given.
         grouping: The VAE and its votes; None where no groups are found.
         labels: Group of each parameter.
-        agents: Discriminators, critics and actors.
         rows: Buffer of simulated rows.
         walkers: Simulated rows that go on in the next epoch.
         watch: Running averages, and the best estimate so far.
-        key: The random key.
         grouped: Number of epochs of grouping so far.
         failures: Number of simulated rows that exploded.
     """

@@ -64,10 +64,6 @@ class NpeState:
     """Everything that NPE carries.
 
     Attributes:
-        clone: The clone of the behaviour policy.
-        walkers: Rows that it acts in.
-        emulator: The emulator of the next row.
-        optimiser: The emulator's optimiser.
         rows: Simulated rows that the emulator is trained on.
         features: Features of next observations, used where they belong to unknown rows.
         sets: Moments of this round's draws, each in two halves.
@@ -77,8 +73,6 @@ class NpeState:
         trained: Whether the emulator has been trained.
         low: Lower ends of the box that is drawn from.
         high: Its upper ends.
-        belief: The posterior.
-        key: The random key.
         failures: Simulated rows that failed.
     """
 

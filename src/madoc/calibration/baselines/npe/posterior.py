@@ -143,8 +143,6 @@ class Belief:
     """What is believed of the parameters, scaled to [-1, 1] of their ranges.
 
     Attributes:
-        mean: Mean of the posterior.
-        covariance: Its covariance.
         interval: Its 95 % interval, columns low and high.
         misfit: Distance of the log's moments from those at the point that they are read as.
         usual_misfit: The distance that a share `UNLIKELY` of the simulated sets stays within.
