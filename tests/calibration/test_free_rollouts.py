@@ -7,7 +7,7 @@ import pytest
 from madoc import simulation
 from madoc.calibration import CalibrationProblem, CmaEs, LeastSquares, Madoc, Oted
 from madoc.calibration.free_rollouts import noise_deviation, rows_compared, with_sensor_noise
-from madoc.calibration.least_squares.calibrator import horizon_of
+from madoc.calibration.least_squares.lengthening import horizon_of
 from madoc.calibration.madoc.state import geometry
 from madoc.data import Disturbance, disturb, observed_task, stride
 from madoc.data.disturbing import row_change

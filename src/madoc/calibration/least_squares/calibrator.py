@@ -7,29 +7,9 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem, Estimate, at_end_of_range
-from madoc.calibration.least_squares import filtering, predicting, sentences
+from madoc.calibration.least_squares import filtering, lengthening, predicting, sentences
 from madoc.calibration.least_squares.known_starts import KnownStarts
-from madoc.calibration.least_squares.lengthening import (
-    LENGTHS,
-    LONGER,
-    READINGS,
-    LeastSquaresState,
-    Stage,
-    after_filter,
-    back_to_filter,
-    begun,
-    enough,
-    failed,
-    finished,
-    gone_on,
-    hopeless,
-    horizon_of,
-    leaves_much_less,
-    lengthened,
-    noise_alone,
-    tells_more,
-    with_search,
-)
+from madoc.calibration.least_squares.lengthening import LENGTHS, LONGER, READINGS, LeastSquaresState, Stage
 from madoc.calibration.least_squares.plan import EXACT, FEWEST, Found, consecutive_residuals, noisy_rows
 from madoc.calibration.least_squares.search import Search, SearchState
 from madoc.calibration.least_squares.unknown_starts import UnknownStarts
@@ -125,14 +105,16 @@ class LeastSquares:
             state = replace(state, prediction=prediction, finished=int(prediction.progress != "under way"))
         elif state.stage == "filtering" and state.filtered is not None:
             by_filter, epoch = filtering.step(problem, state.filtered, self.loss)
-            state = after_filter(problem, replace(state, filtered=by_filter), self._unknown(problem).horizon)
+            state = lengthening.after_filter(
+                problem, replace(state, filtered=by_filter), self._unknown(problem).horizon
+            )
         elif state.estimates_starts:
             search, epoch = self._unknown(problem, state.length).step(problem, state.unknown[state.length])
-            if state.filtered is not None and not leaves_much_less(search, state.filtered):
-                state = back_to_filter(with_search(state, 0, search))
+            if state.filtered is not None and not lengthening.leaves_much_less(search, state.filtered):
+                state = lengthening.back_to_filter(lengthening.with_search(state, 0, search))
             else:
                 state = self._then_predicting(
-                    problem, self._after_unknown(problem, with_search(state, state.length, search))
+                    problem, self._after_unknown(problem, lengthening.with_search(state, state.length, search))
                 )
         else:
             assert state.known is not None
@@ -260,7 +242,7 @@ class LeastSquares:
         """The search with unknown initial states; after one from logged states it needs to begin at one point only."""
         searches = self.searches if self._first_stage(problem) == "estimated" else 1
         fewest = 2 * (FEWEST + len(problem.simulator.parameters))
-        horizon = self.horizon or LENGTHS[length] * horizon_of(problem.dataset, fewest)
+        horizon = self.horizon or LENGTHS[length] * lengthening.horizon_of(problem.dataset, fewest)
         return self._search(UnknownStarts, "estimated", horizon, searches)
 
     def _search(
@@ -287,7 +269,7 @@ class LeastSquares:
         searches = [first]
         for length in range(LONGER, LONGER if self.horizon is not None else len(LENGTHS)):
             most = READINGS * len(first.rows) // LENGTHS[length]
-            longer = lengthened(problem, searches[-1], self._unknown(problem, length).horizon, most)
+            longer = lengthening.lengthened(problem, searches[-1], self._unknown(problem, length).horizon, most)
             if longer is None:
                 break
             searches.append(longer)
@@ -302,12 +284,12 @@ class LeastSquares:
         assert known is not None
         settled = self._known(problem).settled(known)
         if state.stage == "starting" and known.refining:
-            return begun(state, known)
+            return lengthening.begun(state, known)
         if state.stage == "undecided" and (settled or (known.refining and not known.epochs)):
             if np.sqrt(known.cost[0]) >= EXACT:
                 pairs = consecutive_residuals(problem, known.point[0], known.rows)
                 if alternation(*pairs) > NOISY:
-                    return begun(state, known)
+                    return lengthening.begun(state, known)
             state = replace(state, stage="logged" if settled else "undecided")
         return replace(state, finished=int(settled and state.stage == "logged"))
 
@@ -326,26 +308,26 @@ class LeastSquares:
         if state.finished:
             return state
         if not self._unknown(problem).settled(search):
-            lost = length != LONGER and hopeless(search, searches[0], searches[state.best])
+            lost = length != LONGER and lengthening.hopeless(search, searches[0], searches[state.best])
             lost = lost or search.epochs >= self.search_epochs
-            return failed(state) if length >= LONGER and lost else state
+            return lengthening.failed(state) if length >= LONGER and lost else state
         if length and not self._noise_alone(problem, state, length):
-            return finished(state, LONGER) if length == LONGER else failed(state)
-        if length and not tells_more(search, searches[state.best]):
-            return failed(state)
+            return lengthening.finished(state, LONGER) if length == LONGER else lengthening.failed(state)
+        if length and not lengthening.tells_more(search, searches[state.best]):
+            return lengthening.failed(state)
         if float(search.deviation.max()) < EXACT:
-            return finished(state, length)
+            return lengthening.finished(state, length)
         following = length + 1
-        if not length and len(searches) > LONGER and enough(searches[-1], search):
+        if not length and len(searches) > LONGER and lengthening.enough(searches[-1], search):
             following = len(searches) - 1
         if following == len(searches) or self._unknown(problem).settled(searches[following]):
-            return finished(state, length)
-        return gone_on(replace(state, best=length), following)
+            return lengthening.finished(state, length)
+        return lengthening.gone_on(replace(state, best=length), following)
 
     def _noise_alone(self, problem: CalibrationProblem, state: LeastSquaresState, length: int) -> bool:
         """Whether residuals of windows of this length are the noise that those of the shortest windows are."""
         readings = self._unknown(problem, length).horizon + 1
-        return noise_alone(state.unknown[length], state.unknown[0], readings)
+        return lengthening.noise_alone(state.unknown[length], state.unknown[0], readings)
 
     def _leaves_more_than_noise(self, problem: CalibrationProblem, state: LeastSquaresState) -> bool:
         """Whether the model may lack something, so that another estimate may predict better.

@@ -16,28 +16,9 @@ from jaxtyping import Float, PRNGKeyArray, PyTree
 from pydantic import Field
 
 from madoc.calibration.base import CalibrationProblem, Estimate, at_end_of_range
-from madoc.calibration.baselines.npe.moments import (
-    Cosines,
-    Emulator,
-    Sets,
-    by_halves,
-    cosines,
-    fresh_emulator,
-    logged_moments,
-    moved,
-    set_moments,
-    standardised,
-    train,
-    unpaired,
-)
-from madoc.calibration.baselines.npe.posterior import (
-    Belief,
-    belief_of,
-    doubts,
-    posterior_samples,
-    prior_belief,
-    truncated_box,
-)
+from madoc.calibration.baselines.npe import moments, posterior
+from madoc.calibration.baselines.npe.moments import Cosines, Emulator, Sets
+from madoc.calibration.baselines.npe.posterior import Belief
 from madoc.calibration.free_rollouts import (
     SensorNoise,
     begin_freely,
@@ -157,8 +138,8 @@ class Npe:
         simulator, length = problem.simulator, rows_compared(problem)
         size, count = simulator.task.observation_size, len(simulator.parameters)
         window = length * (size + simulator.action_size)
-        emulator = fresh_emulator(window, size, count, self.hidden, of_emulator)
-        kept = size + (self.features if unpaired(problem) else count)
+        emulator = moments.fresh_emulator(window, size, count, self.hidden, of_emulator)
+        kept = size + (self.features if moments.unpaired(problem) else count)
         sets, box = (self.epochs * self.draws, 2), np.ones(count)
         return NpeState(
             clone=fresh_clone(
@@ -168,7 +149,7 @@ class Npe:
             emulator=emulator,
             optimiser=self._optimiser(emulator),
             rows=replay.empty(self.replay_capacity, window=(window,), following=(size,), scaled=(count,)),
-            features=cosines(of_features, size, self.features, WIDTHS),
+            features=moments.cosines(of_features, size, self.features, WIDTHS),
             sets=Sets(np.zeros((*sets, kept)), np.zeros((*sets, kept, count)), np.zeros(sets)),
             points=np.zeros((self.epochs * self.draws, count)),
             collected=0,
@@ -176,7 +157,7 @@ class Npe:
             trained=0,
             low=-box,
             high=box,
-            belief=prior_belief(count),
+            belief=posterior.prior_belief(count),
             key=key,
         )
 
@@ -191,7 +172,7 @@ class Npe:
         space, belief = problem.simulator.parameters, state.belief
         half = (space.high - space.low) / 2.0
         covariance = half[:, None] * belief.covariance * half
-        warnings = doubts(belief, space.names)
+        warnings = posterior.doubts(belief, space.names)
         return Estimate(
             mean=space.to_physical(belief.mean),
             std=np.sqrt(np.diag(covariance)),
@@ -256,8 +237,11 @@ class Npe:
         window, following, valid = windows_of(rollout, scaling)
         sets, place = state.sets, slice(state.collected * self.draws, (state.collected + 1) * self.draws)
         if state.trained:
-            fresh = set_moments(
-                problem, state.emulator, state.features, *(by_halves(part) for part in (window, following, valid))
+            fresh = moments.set_moments(
+                problem,
+                state.emulator,
+                state.features,
+                *(moments.by_halves(part) for part in (window, following, valid)),
             )
             sets = jax.tree.map(lambda old, new: _written(old, place, new), sets, fresh)
         scaled = np.broadcast_to(points[:, None], (*valid.shape, points.shape[1]))
@@ -276,10 +260,10 @@ class Npe:
             return state
         whole = np.resize(whole, len(state.points))  # JAX compiles anew for each number of draws
         middle, half = (np.asarray(part, np.float64) for part in (state.emulator.middle, state.emulator.half))
-        samples, misfit, usual_misfit = posterior_samples(
+        samples, misfit, usual_misfit = posterior.posterior_samples(
             jax.tree.map(lambda part: part[whole], state.sets),
             ((state.points - middle) / half)[whole],
-            logged_moments(problem, state.emulator, state.features),
+            moments.logged_moments(problem, state.emulator, state.features),
             key,
             layers=self.flow_layers,
             width=self.flow_width,
@@ -288,8 +272,8 @@ class Npe:
             count=self.samples,
         )
         samples = np.clip(middle + half * samples, -1.0, 1.0)
-        low, high = truncated_box(samples, self.widening, self.smallest_half)
-        belief = belief_of(samples, misfit, usual_misfit, state.belief.rounds + 1)
+        low, high = posterior.truncated_box(samples, self.widening, self.smallest_half)
+        belief = posterior.belief_of(samples, misfit, usual_misfit, state.belief.rounds + 1)
         return replace(state, belief=belief, low=low, high=high)
 
     def _fit(self, problem: CalibrationProblem, state: NpeState) -> tuple[NpeState, Epoch]:
@@ -297,10 +281,10 @@ class Npe:
         of_batches, key = jax.random.split(state.key)
         emulator, optimiser = state.emulator, state.optimiser
         if not state.fitted:
-            emulator = emulator if state.trained else standardised(emulator, state.rows)
-            emulator = moved(emulator, (state.high + state.low) / 2.0, (state.high - state.low) / 2.0)
+            emulator = emulator if state.trained else moments.standardised(emulator, state.rows)
+            emulator = moments.moved(emulator, (state.high + state.low) / 2.0, (state.high - state.low) / 2.0)
             optimiser = self._optimiser(emulator)
-        emulator, optimiser, loss = train(
+        emulator, optimiser, loss = moments.train(
             emulator,
             optimiser,
             state.rows,
