@@ -219,9 +219,19 @@ class CmaEs:
         if not acts:
             first_rows(problem.dataset, problem.states.exact()[1], 1)
         of_features, of_actor, key = jax.random.split(key, 3)
+        window, size, clouds, actor = self._window(problem), problem.simulator.task.observation_size, None, None
+        if self.objective == "distribution":
+            of_pairs, of_observations = jax.random.split(of_features)
+            pairs = cosine_features(of_pairs, window * (size + problem.simulator.action_size), self.features)
+            nothing = np.zeros(self.features)
+            clouds = Clouds(pairs, cosine_features(of_observations, size, self.features), nothing, nothing)
+        if acts:
+            of_policy, of_start = jax.random.split(of_actor)
+            seen = problem.features.pairs(window - 1)
+            clone = fresh_clone(seen, self.hidden, learning_rate=self.learning_rate, key=of_policy)
+            walkers = begin_freely(problem, window, of_start, systems=1, rows=self.rows or ROWS["policy"])
+            actor = Actor(clone, walkers)
         search = Evolution.about(np.zeros(len(problem.simulator.parameters)))
-        clouds = None if self.objective == "one-step" else self._begin_clouds(problem, of_features)
-        actor = self._begin_actor(problem, of_actor) if acts else None
         return CmaEsState(SearchState(search, key), clouds, actor)
 
     def step(self, problem: CalibrationProblem, state: CmaEsState) -> tuple[CmaEsState, Epoch]:
@@ -258,26 +268,6 @@ class CmaEs:
     def _window(self, problem: CalibrationProblem) -> int:
         """Rows that are compared at a time."""
         return rows_compared(problem) if self._acts(problem) else 1
-
-    def _begin_clouds(self, problem: CalibrationProblem, key: PRNGKeyArray) -> Clouds:
-        of_pairs, of_observations = jax.random.split(key)
-        size, nothing = problem.simulator.task.observation_size, np.zeros(self.features)
-        return Clouds(
-            of_pairs=cosine_features(
-                of_pairs, self._window(problem) * (size + problem.simulator.action_size), self.features
-            ),
-            of_observations=cosine_features(of_observations, size, self.features),
-            pair=nothing,
-            change=nothing,
-        )
-
-    def _begin_actor(self, problem: CalibrationProblem, key: PRNGKeyArray) -> Actor:
-        of_policy, of_start = jax.random.split(key)
-        window, rows = self._window(problem), self.rows or ROWS["policy"]
-        clone = fresh_clone(
-            problem.features.pairs(window - 1), self.hidden, learning_rate=self.learning_rate, key=of_policy
-        )
-        return Actor(clone, begin_freely(problem, window, of_start, systems=1, rows=rows))
 
     def _clone(self, problem: CalibrationProblem, state: CmaEsState, actor: Actor) -> tuple[CmaEsState, Epoch]:
         clone, key, epoch = cloning_epoch(
