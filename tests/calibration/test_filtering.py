@@ -234,7 +234,7 @@ def test_only_what_a_larger_ensemble_loses_too_counts_as_lost(tmp_path, monkeypa
         costs[[2, 4, 5]] = 9.0, 9.0, np.inf
         return costs if len(asked) == 1 else np.array([0.5, 7.0, np.inf])
 
-    monkeypatch.setattr(filtering, "surprises", by_hand)
+    monkeypatch.setattr(instruments, "surprises", by_hand)
     (after, _), spent = counted(filtering.step, problem, rest, "cauchy")
     assert asked == [search.size, 3]
     assert after.cost == pytest.approx((0.5 * (search.size - 2) + 7.0) / (search.size - 1))

@@ -15,21 +15,8 @@ from jaxtyping import Float, PRNGKeyArray
 from scipy.optimize import minimize_scalar
 
 from madoc.calibration.base import CalibrationProblem
-from madoc.calibration.least_squares.instruments import (
-    FEW,
-    LIKE_CHANCE,
-    MEMBERS,
-    NEAR,
-    FilterState,
-    Side,
-    agreed,
-    axes_of,
-    moved_by,
-    over_windows,
-    products_of,
-    shares_of,
-    surprises,
-)
+from madoc.calibration.least_squares import instruments
+from madoc.calibration.least_squares.instruments import LIKE_CHANCE, MEMBERS, NEAR, FilterState, Side
 from madoc.calibration.least_squares.plan import FEWEST, LONG_TAILS, touched
 from madoc.data import stride
 from madoc.identification.ensembles import SPOILT, FilteredWindows, next_noise, with_noise
@@ -147,7 +134,7 @@ def epoch_steps(problem: CalibrationProblem, state: FilterState) -> int:
     if sizes := {"trial": 2, "size": 1 + SIZES}.get(state.asked):
         return sizes * SIZE_ROUNDS * MEMBERS * min(state.size, len(state.rows)) * state.horizon
     tried, rounds = 0 if state.at_rest else 1 + len(TRIALS), 1 if state.wide else NOISE_ROUNDS
-    systems = rounds * state.members + (2 * 2 * len(problem.simulator.parameters) + tried) * FEW
+    systems = rounds * state.members + (2 * 2 * len(problem.simulator.parameters) + tried) * instruments.FEW
     windows = len(state.rows[state.block])
     large = LARGE_ROUNDS * LARGE * min(windows, state.size) if state.at_rest and state.to_compare == 1 else 0
     return (systems * windows + large) * state.horizon
@@ -182,7 +169,7 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
     given = windows, found, state.point, state.spread, count
     sides = [Side.of(*given, each, state.force) for each in random[:2]]
     whole = found.whole[0] & sides[0].ends.whole.all(0) & sides[1].ends.whole.all(0)
-    fresh = products_of(sides[0], sides[1], whole, loss)
+    fresh = instruments.products_of(sides[0], sides[1], whole, loss)
     if state.at_rest:
         # Errors of ensembles are in inverse proportion to their size: half errs by as much again.
         both = whole & state.squares[block].any((1, 2))
@@ -205,33 +192,33 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
         _counted(kept if together > 1 else np.zeros_like(kept), each, block, 1 + max(0, together - 1) // state.blocks)
         for kept, each in zip((state.gradients, state.products, state.squares), fresh, strict=True)
     )
-    bread = agreed(products.sum(0), squares.sum(0))
+    bread = instruments.agreed(products.sum(0), squares.sum(0))
     factor = np.linalg.cholesky(bread).T
     target = np.linalg.solve(factor.T, gradients.sum(0))
     undamped = damped_step(factor, target, state.point, 0.0)
     taken, damping = _taken(problem, state, readings, sides[0], factor, target, loss)
-    told, seen = shares_of(squares), int(squares.any((1, 2)).sum())
+    told, seen = instruments.shares_of(squares), int(squares.any((1, 2)).sum())
     left_out = np.linalg.inv(np.eye(len(bread)) - MOST_TOLD * told)
     scores = (left_out @ gradients[..., None])[..., 0]  # about what leaving the window out would change
     meat = scores.T @ scores * seen / max(1, seen - len(state.point))
     covariance = sandwich(bread, meat).covariance
     error = np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
     noise = next_noise(state.noise, 1.0 + (found.noise_ratio() - 1.0) / max(1, together), rounding)
-    moved, pull = moved_by(undamped, error), bread @ undamped
+    moved, pull = instruments.moved_by(undamped, error), bread @ undamped
     quiet = bool((((noise / state.noise) ** 2 - 1.0) ** 2).mean() < NOISE_SETTLED**2)
     refused = not np.array_equal(taken, np.clip(undamped, -LONGEST, LONGEST))
     following = replace(
         state,
         point=state.point + taken,
         damping=damping,
-        spread=axes_of(covariance),
+        spread=instruments.axes_of(covariance),
         noise=noise,
         gradients=gradients + told @ (bread @ taken),
         products=products,
         squares=squares,
         meat=meat + np.outer(pull, pull),
         moved=max(moved, LIKE_CHANCE) if refused else moved,
-        cost=over_windows(surprises(found, loss)),
+        cost=instruments.over_windows(instruments.surprises(found, loss)),
         wide=state.wide + 1 if state.wide else int(state.epochs + 1 >= EARLY_EPOCHS or (quiet and moved < NEAR)),
         quiet=int(quiet),
         together=together,
@@ -292,15 +279,15 @@ def with_what_is_left(
     Spends `LARGE_ROUNDS` · windows · `LARGE` · steps control steps, and those of larger ensembles in windows lost.
     """
     found, noise = with_noise(windows, state.point, state.noise, rounding, LARGE, LARGE_ROUNDS, random, state.force)
-    costs = surprises(found, loss)
+    costs = instruments.surprises(found, loss)
     followed = costs <= LONG_TAILS
     if (lost := np.flatnonzero(~followed)).size:
         # An ensemble may lose what it follows by chance. What the model lacks surprises a larger one as well.
         again, count = windows.of(lost), LARGER * LARGE
         larger, _ = with_noise(again, state.point, found.noise, rounding, count, 1, random, state.force)
-        costs[lost] = np.minimum(costs[lost], surprises(larger, loss))
+        costs[lost] = np.minimum(costs[lost], instruments.surprises(larger, loss))
     share = found.explained_by(windows.readings.actions, followed)
-    return replace(state, noise=noise, cost=over_windows(costs), alike=found.alike(), explained_share=share)
+    return replace(state, noise=noise, cost=instruments.over_windows(costs), alike=found.alike(), explained_share=share)
 
 
 def with_trial(windows: FilteredWindows, state: FilterState, rounding: Float[np.ndarray, " channels"]) -> FilterState:
