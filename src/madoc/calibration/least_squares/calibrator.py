@@ -176,6 +176,7 @@ class LeastSquares:
     def estimate(self, problem: CalibrationProblem, state: LeastSquaresState) -> Estimate:
         """The best search's point, with its sandwich covariance and intervals of Student's t."""
         space, found = problem.simulator.parameters, self._found(problem, state)
+        notes, about = self._told(problem, state)
         point, uncertainty = found.point, found.uncertainty
         prediction, progress = state.prediction, state.prediction.progress if state.prediction else "not begun"
         if prediction is not None and progress == "better":
@@ -190,12 +191,12 @@ class LeastSquares:
             mean=mean,
             std=np.sqrt(np.diag(covariance)),
             failures=sum(each.failures for each in (state.known, state.filtered, *state.unknown) if each is not None),
-            notes=self._notes(problem, state),
+            notes=notes,
             warnings=(
                 *identifiability(uncertainty, space.names),
                 *at_end_of_range(point, space, space.to_unit(interval.T).T),
                 *(() if found.settled else (sentences.NOT_SETTLED,)),
-                *self._about_residuals(problem, state),
+                *about,
                 *((sentences.PREDICTS,) if progress == "better" else ()),
                 *((sentences.STILL_PREDICTING,) if progress == "under way" else ()),
             ),
@@ -354,28 +355,21 @@ class LeastSquares:
                 return longer
         return None
 
-    def _notes(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[str, ...]:
-        """A sentence on estimated initial states, unless the user asked for them."""
+    def _told(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Notes on estimated initial states, and warnings of what they leave, unless the user asked for them."""
         if state.by_filter is not None:
-            return (sentences.about_filtered_states(problem, state.by_filter, asked=self.initial_states is not None),)
+            note = sentences.about_filtered_states(problem, state.by_filter, asked=self.initial_states is not None)
+            return (note,), sentences.about_surprises(problem, state.by_filter)
         if not state.estimates_starts or self.initial_states is not None:
-            return ()
-        horizon = self._unknown(problem, state.best).horizon
-        return (sentences.about_estimated_states(problem, state.unknown[state.best], horizon),)
-
-    def _about_residuals(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[str, ...]:
-        """Sentences on what estimated initial states leave, unless the user asked for them."""
-        if state.by_filter is not None:
-            return sentences.about_surprises(problem, state.by_filter)
-        if not state.estimates_starts or self.initial_states is not None:
-            return ()
-        best = state.unknown[state.best]
-        about = sentences.about_residuals(problem, best)
-        if float(best.deviation.max()) < EXACT:
-            return about
-        if state.stage == "lengthening" and not state.searched:
-            return (*about, sentences.STILL_LENGTHENING)
-        longer = self._with_model_errors(problem, state)
-        if longer is not None:
-            return (*about, sentences.about_model_errors(self._unknown(problem, longer).horizon))
-        return about
+            return (), ()
+        best, horizon = state.unknown[state.best], self._unknown(problem, state.best).horizon
+        notes, about = (
+            (sentences.about_estimated_states(problem, best, horizon),),
+            sentences.about_residuals(problem, best),
+        )
+        if float(best.deviation.max()) >= EXACT:
+            if state.stage == "lengthening" and not state.searched:
+                about = (*about, sentences.STILL_LENGTHENING)
+            elif (longer := self._with_model_errors(problem, state)) is not None:
+                about = (*about, sentences.about_model_errors(self._unknown(problem, longer).horizon))
+        return notes, about
