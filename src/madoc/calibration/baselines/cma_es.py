@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 from pydantic import Field
 
+from madoc.calibration import free_rollouts
 from madoc.calibration.base import CalibrationProblem, Estimate
 from madoc.calibration.baselines.population_search import (
     Candidates,
@@ -24,15 +25,7 @@ from madoc.calibration.baselines.population_search import (
     next_generation,
     replay_residuals,
 )
-from madoc.calibration.free_rollouts import (
-    SensorNoise,
-    begin_freely,
-    noise_deviation,
-    roll_freely,
-    rows_compared,
-    windows_of,
-    without_starts,
-)
+from madoc.calibration.free_rollouts import SensorNoise
 from madoc.errors import MadocError
 from madoc.identification.windows import first_rows
 from madoc.learning.cloning import Clone, cloning_epoch, fresh_clone
@@ -229,7 +222,7 @@ class CmaEs:
             of_policy, of_start = jax.random.split(of_actor)
             seen = problem.features.pairs(window - 1)
             clone = fresh_clone(seen, self.hidden, learning_rate=self.learning_rate, key=of_policy)
-            walkers = begin_freely(problem, window, of_start, systems=1, rows=self.rows or ROWS["policy"])
+            walkers = free_rollouts.begin_freely(problem, window, of_start, systems=1, rows=self.rows or ROWS["policy"])
             actor = Actor(clone, walkers)
         search = Evolution.about(np.zeros(len(problem.simulator.parameters)))
         return CmaEsState(SearchState(search, key), clouds, actor)
@@ -267,7 +260,7 @@ class CmaEs:
 
     def _window(self, problem: CalibrationProblem) -> int:
         """Rows that are compared at a time."""
-        return rows_compared(problem) if self._acts(problem) else 1
+        return free_rollouts.rows_compared(problem) if self._acts(problem) else 1
 
     def _clone(self, problem: CalibrationProblem, state: CmaEsState, actor: Actor) -> tuple[CmaEsState, Epoch]:
         clone, key, epoch = cloning_epoch(
@@ -339,17 +332,17 @@ class CmaEs:
         """Clouds that the clone visits under each candidate, from where the best one of the last generation stopped."""
         of_actions, of_restarts = jax.random.split(key)
         length = self._window(problem)
-        rollout, after = roll_freely(
+        rollout, after = free_rollouts.roll_freely(
             problem,
             actor.clone.policy,
             candidates,
             jax.tree.map(lambda part: np.repeat(part, len(candidates), axis=0), actor.walkers),
             steps=self.horizon,
-            noise=noise_deviation(problem, self.sensor_noise, length),
+            noise=free_rollouts.noise_deviation(problem, self.sensor_noise, length),
             keys=(of_actions, of_restarts),
         )
-        windows, _, whole = windows_of(rollout, problem.features.windows("standardised", length)[0])
-        windows = np.where(whole[..., None], windows, np.nan)[without_starts(length)]
+        windows, _, whole = free_rollouts.windows_of(rollout, problem.features.windows("standardised", length)[0])
+        windows = np.where(whole[..., None], windows, np.nan)[free_rollouts.without_starts(length)]
         rows = np.swapaxes(windows, 0, 1).reshape(len(candidates), -1, windows.shape[-1])
         costs = discrepancies(clouds.of_pairs(rows), clouds.pair)
         costs = mean_with_failures(costs[:, None])

@@ -16,18 +16,10 @@ import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 from pydantic import Field
 
+from madoc.calibration import free_rollouts
 from madoc.calibration.base import CalibrationProblem, Estimate
 from madoc.calibration.baselines.population_search import independent_estimate
-from madoc.calibration.free_rollouts import (
-    SensorNoise,
-    begin_freely,
-    noise_deviation,
-    require_rows,
-    roll_freely,
-    rows_compared,
-    windows_of,
-    without_starts,
-)
+from madoc.calibration.free_rollouts import SensorNoise
 from madoc.data import Dataset
 from madoc.identification.windows import first_rows
 from madoc.learning import replay
@@ -262,7 +254,7 @@ class Oted:
             discriminator=discriminator,
             discriminator_optimiser=adam(self.learning_rate).init(eqx.filter(discriminator, eqx.is_array)),
             rows=replay.empty(self.replay_capacity, pair=(pair,)),
-            walkers=begin_freely(
+            walkers=free_rollouts.begin_freely(
                 problem, self._window(problem), of_start, systems=self._systems, rows=self.rows, spread=False
             ),
             distribution=distribution,
@@ -289,7 +281,7 @@ class Oted:
 
     def _window(self, problem: CalibrationProblem) -> int:
         """Rows that are compared at a time; single ones where rollouts start at logged states."""
-        return 1 if self._anew(problem) else rows_compared(problem)
+        return 1 if self._anew(problem) else free_rollouts.rows_compared(problem)
 
     def _clone(self, problem: CalibrationProblem, state: OtedState) -> tuple[OtedState, Epoch]:
         clone, key, epoch = cloning_epoch(
@@ -342,20 +334,22 @@ class Oted:
             judged = replace(rollout, valid=first_lives(rollout.transitions, rollout.valid))
         else:
             reached = np.ones(len(last_rows(problem.dataset, length)), np.int64)
-            rollout, walkers = roll_freely(
+            rollout, walkers = free_rollouts.roll_freely(
                 problem,
                 state.clone.policy,
                 draws,
                 walkers,
                 steps=self.horizon,
-                noise=noise_deviation(problem, self.sensor_noise, length),
+                noise=free_rollouts.noise_deviation(problem, self.sensor_noise, length),
                 keys=keys,
             )
             judged = rollout
         scaling, (logged, _) = problem.features.windows("standardised", length)
-        pairs, _, valid = (part[without_starts(length)] for part in windows_of(judged, scaling))
+        pairs, _, valid = (
+            part[free_rollouts.without_starts(length)] for part in free_rollouts.windows_of(judged, scaling)
+        )
         rows = replay.add(state.rows, {"pair": replay.flatten_rows(pairs, 3)}, valid.reshape(-1))
-        require_rows(rows, "oted", length)
+        free_rollouts.require_rows(rows, "oted", length)
         discriminator, optimiser_state, loss = learn(
             state.discriminator,
             state.discriminator_optimiser,

@@ -14,15 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
+from madoc.calibration import free_rollouts
 from madoc.calibration.base import CalibrationProblem, Estimate
-from madoc.calibration.free_rollouts import (
-    SensorNoise,
-    begin_freely,
-    noise_deviation,
-    require_rows,
-    roll_freely,
-    rows_compared,
-)
+from madoc.calibration.free_rollouts import SensorNoise
 from madoc.calibration.madoc import grouping, watch
 from madoc.calibration.madoc.agents import AgentSettings, Mixing, draw_parameters, squashed
 from madoc.calibration.madoc.grouping import Grouping, GroupingVAE, Votes
@@ -132,7 +126,7 @@ class Madoc:
         """
         problem.require_pairs()
         count, groups = len(problem.simulator.parameters), self._group_count(problem)
-        noise = noise_deviation(problem, self.sensor_noise or 0.0, rows=1)
+        noise = free_rollouts.noise_deviation(problem, self.sensor_noise or 0.0, rows=1)
         collection = self._collection(problem, noise)
         window, following = collection.scaling.sizes
         of_policy, of_expectation, of_vae, of_agents, of_start, key = jax.random.split(key, 6)
@@ -159,7 +153,9 @@ class Madoc:
             rows=replay.empty(
                 self.replay_capacity, pair=(window,), following=(following,), parameters=(count,), identity=()
             ),
-            walkers=begin_freely(problem, length, of_start, systems=systems, rows=collection.rows(systems)),
+            walkers=free_rollouts.begin_freely(
+                problem, length, of_start, systems=systems, rows=collection.rows(systems)
+            ),
             watch=watch.Watch(agents.average),
             key=key,
         )
@@ -209,7 +205,7 @@ class Madoc:
 
     def _length(self, problem: CalibrationProblem) -> int:
         """Rows that discriminators see; as many as the clone, which has to tell the state as they do."""
-        return self.window or rows_compared(problem)
+        return self.window or free_rollouts.rows_compared(problem)
 
     def _group_count(self, problem: CalibrationProblem) -> int:
         """Number of groups."""
@@ -266,8 +262,10 @@ class Madoc:
         count, collection = len(problem.simulator.parameters), self._collection(problem, state.noise)
         of_draws, of_start, of_action, of_restart, of_batches, key = jax.random.split(state.key, 6)
         draws, length = grouping.one_at_a_time(of_draws, count), collection.scaling.length
-        walkers = begin_freely(problem, length, of_start, systems=count, rows=collection.rows(count), spread=False)
-        rollout, _ = roll_freely(
+        walkers = free_rollouts.begin_freely(
+            problem, length, of_start, systems=count, rows=collection.rows(count), spread=False
+        )
+        rollout, _ = free_rollouts.roll_freely(
             problem,
             state.clone.policy,
             draws,
@@ -281,7 +279,7 @@ class Madoc:
         voting = grouped > self.grouping_epochs - grouping.voting_epochs(self.grouping_epochs)
         votes, loss = grouping.learn_votes(
             votes,
-            require_rows(rows, "madoc", collection.scaling.length),
+            free_rollouts.require_rows(rows, "madoc", collection.scaling.length),
             of_batches,
             learning_rate=self.learning_rate,
             batch=self.batch,
@@ -307,7 +305,7 @@ class Madoc:
         collection, expectation = self._collection(problem, state.noise), state.expectation
         draws = np.asarray(draw_parameters(state.agents.actors, of_draws, collection.systems)[0], dtype=np.float64)
         probes = np.stack([squashed(state.agents.actors)[0], np.zeros(draws.shape[1])])
-        everything, walkers = roll_freely(
+        everything, walkers = free_rollouts.roll_freely(
             problem,
             state.clone.policy,
             np.concatenate([draws, probes]),
@@ -324,7 +322,7 @@ class Madoc:
         logged = (collection.logged[0], expectation.logged) if expectation else collection.logged
         agents, device_metrics = self.agents.update(
             state.agents,
-            require_rows(rows, "madoc", collection.scaling.length),
+            free_rollouts.require_rows(rows, "madoc", collection.scaling.length),
             logged,
             jnp.asarray(grouping.members(state.labels, self._group_count(problem))),
             of_updates,

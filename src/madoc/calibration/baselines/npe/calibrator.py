@@ -15,19 +15,12 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray, PyTree
 from pydantic import Field
 
+from madoc.calibration import free_rollouts
 from madoc.calibration.base import CalibrationProblem, Estimate, at_end_of_range
 from madoc.calibration.baselines.npe import moments, posterior
 from madoc.calibration.baselines.npe.moments import Cosines, Emulator, Sets
 from madoc.calibration.baselines.npe.posterior import Belief
-from madoc.calibration.free_rollouts import (
-    SensorNoise,
-    begin_freely,
-    noise_deviation,
-    require_rows,
-    roll_freely,
-    rows_compared,
-    windows_of,
-)
+from madoc.calibration.free_rollouts import SensorNoise
 from madoc.learning import replay
 from madoc.learning.cloning import Clone, cloning_epoch, fresh_clone
 from madoc.learning.features import HIDDEN_WINDOW
@@ -135,7 +128,7 @@ class Npe:
     def init(self, problem: CalibrationProblem, key: PRNGKeyArray) -> NpeState:
         """Fresh networks, the whole box to draw from, rows at resets."""
         of_clone, of_emulator, of_features, of_start, key = jax.random.split(key, 5)
-        simulator, length = problem.simulator, rows_compared(problem)
+        simulator, length = problem.simulator, free_rollouts.rows_compared(problem)
         size, count = simulator.task.observation_size, len(simulator.parameters)
         window = length * (size + simulator.action_size)
         emulator = moments.fresh_emulator(window, size, count, self.hidden, of_emulator)
@@ -145,7 +138,7 @@ class Npe:
             clone=fresh_clone(
                 problem.features.pairs(length - 1), self.hidden, learning_rate=self.learning_rate, key=of_clone
             ),
-            walkers=begin_freely(problem, length, of_start, systems=self.draws, rows=self.rows),
+            walkers=free_rollouts.begin_freely(problem, length, of_start, systems=self.draws, rows=self.rows),
             emulator=emulator,
             optimiser=self._optimiser(emulator),
             rows=replay.empty(self.replay_capacity, window=(window,), following=(size,), scaled=(count,)),
@@ -194,7 +187,7 @@ class Npe:
     def _clone(self, problem: CalibrationProblem, state: NpeState) -> tuple[NpeState, Epoch]:
         clone, key, epoch = cloning_epoch(
             state.clone,
-            problem.features.pairs(rows_compared(problem) - 1),
+            problem.features.pairs(free_rollouts.rows_compared(problem) - 1),
             state.key,
             learning_rate=self.learning_rate,
             batch=self.cloning_batch,
@@ -208,13 +201,13 @@ class Npe:
         of_draws, of_actions, of_restarts, of_posterior, key = jax.random.split(state.key, 5)
         uniform = np.asarray(jax.random.uniform(of_draws, (self.draws, len(state.low))), np.float64)
         points = state.low + (state.high - state.low) * uniform
-        rollout, walkers = roll_freely(
+        rollout, walkers = free_rollouts.roll_freely(
             problem,
             state.clone.policy,
             points,
             state.walkers,
             steps=self.horizon,
-            noise=noise_deviation(problem, self.sensor_noise, rows_compared(problem)),
+            noise=free_rollouts.noise_deviation(problem, self.sensor_noise, free_rollouts.rows_compared(problem)),
             keys=(of_actions, of_restarts),
         )
         state = self._collect(problem, state, rollout, points)
@@ -233,8 +226,8 @@ class Npe:
         Raises:
             MadocError: No window has been whole so far.
         """
-        scaling, _ = problem.features.windows("standardised", rows_compared(problem))
-        window, following, valid = windows_of(rollout, scaling)
+        scaling, _ = problem.features.windows("standardised", free_rollouts.rows_compared(problem))
+        window, following, valid = free_rollouts.windows_of(rollout, scaling)
         sets, place = state.sets, slice(state.collected * self.draws, (state.collected + 1) * self.draws)
         if state.trained:
             fresh = moments.set_moments(
@@ -249,7 +242,7 @@ class Npe:
         rows = replay.add(
             state.rows, {name: replay.flatten_rows(part, 3) for name, part in columns.items()}, valid.reshape(-1)
         )
-        require_rows(rows, "npe", scaling.length)
+        free_rollouts.require_rows(rows, "npe", scaling.length)
         written = _written(state.points, place, points)
         return replace(state, rows=rows, sets=sets, points=written, collected=state.collected + 1)
 
