@@ -17,7 +17,7 @@ from madoc.simulation.gears import SUFFIX
 from madoc.simulation.user_data import LEAST_FRICTION
 from madoc.simulation.write import OF_A_JOINT, ONE_DOF
 from madoc.tasks.base import compiled_model
-from madoc.tasks.mujoco_versions import refuse_unfit_mujoco
+from madoc.tasks.physics import refuse_unfit_mujoco
 
 REFERRING = ("sensors", "equalities", "excludes", "pairs", "tendons", "actuators")
 """Parts of a model that refer to others by name."""

@@ -1,14 +1,11 @@
-"""The robots of the paper, one file each; `TASKS` lists them by name."""
+"""The robots of the paper; `TASKS` lists them by name."""
 
 from collections.abc import Callable
 from functools import cache
 
 from madoc.errors import unknown_name
-from madoc.tasks.ant import ant
 from madoc.tasks.base import ActionChannel, Task
-from madoc.tasks.half_cheetah import half_cheetah
-from madoc.tasks.hopper import hopper
-from madoc.tasks.walker2d import walker2d
+from madoc.tasks.walking import ant, half_cheetah, hopper, walker2d
 
 TASKS: dict[str, Callable[[str], Task]] = {
     "hopper": hopper,
