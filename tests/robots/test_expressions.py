@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from madoc.errors import MadocError
-from madoc.robots.expressions import Read
-from madoc.robots.grammar import Scope, parse
+from madoc.robots.expressions import Read, Scope, parse
 
 VALUES = {"position(a)": 0.5, "velocity(a)": -2.0, "sensor(tip)[2]": 3.0, "position('left-knee')": 0.25}
 

@@ -10,7 +10,7 @@ from madoc.data import Dataset
 from madoc.data.findings import Finding
 from madoc.diagnosis.speeds import STRETCH, unit_mistake
 from madoc.robots import Robot
-from madoc.robots.grammar import parse
+from madoc.robots.expressions import parse
 from madoc.robots.signals import frame_of, frame_of_attitude, is_accelerometer, is_gyroscope
 
 LENGTH = 0.05

@@ -3,8 +3,7 @@
 import mujoco
 import numpy as np
 
-from madoc.robots.drives import drive_numbers
-from madoc.robots.gears import encoder_tendon
+from madoc.robots.drives import drive_numbers, encoder_tendon
 from madoc.robots.model import AddedActuator, Draft, is_slide
 from madoc.robots.spec import SCALES, ActionSpec
 from madoc.simulation.write import OF_A_JOINT

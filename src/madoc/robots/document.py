@@ -1,10 +1,17 @@
-"""YAML with the line of everything in it, so that a mistake is reported where it was made; and YAML written."""
+"""YAML with the line of everything in it, so that a mistake is reported where it was made; and YAML written.
+
+Pydantic's findings in such a document are each one sentence with that line.
+"""
 
 import io
-from collections.abc import Iterable, Iterator
+import math
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Annotated
 
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import ErrorDetails
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 from ruamel.yaml.constructor import RoundTripConstructor
@@ -12,12 +19,12 @@ from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent, Event, NodeEvent
 from ruamel.yaml.nodes import MappingNode, Node
 
-from madoc.errors import MadocError, nearest_hint
+from madoc.errors import UNPRINTABLE, MadocError, nearest_hint
 
 Place = tuple[str | int, ...]
 """Path to a value: keys and positions, as `("signals", 0, "name")`."""
 
-LARGEST = 200_000
+LARGEST_FILE = 200_000
 """Largest size of a file in bytes; a larger one is refused. The spec of a robot with a hundred joints has 20,000."""
 DEEPEST = 20
 """Deepest nesting of lists and mappings; anything deeper is refused."""
@@ -78,8 +85,8 @@ def read_document(
         what: What the file should be, for the sentence of a refusal.
         remedy: What to do where it is empty, for the same.
     """
-    if len(content) > LARGEST:
-        raise MadocError(f"{file} has {len(content):,} bytes, {what} at most {LARGEST:,}; is it the right file?")
+    if len(content) > LARGEST_FILE:
+        raise MadocError(f"{file} has {len(content):,} bytes, {what} at most {LARGEST_FILE:,}; is it the right file?")
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -176,3 +183,112 @@ class _Constructor(RoundTripConstructor):
 
 # A date in a file, as the name of a folder of logs may be one, is text like any other word.
 _Constructor.add_constructor("tag:yaml.org,2002:timestamp", RoundTripConstructor.construct_yaml_str)
+
+
+_WORDS = {
+    "float_type": "a number",
+    "float_parsing": "a number",
+    "model_type": "keys and values",
+    "dataclass_type": "keys and values",
+    "dict_type": "keys and values",
+    "list_type": "a list",
+    "tuple_type": "a list",
+    "int_type": "a whole number",
+    "string_type": "text",
+    "path_type": "text",
+    "bool_type": "true or false",
+    "string_pattern_mismatch": "a printable name",
+}
+"""What was expected, by pydantic's name of the mistake."""
+
+
+LARGEST = 1e12
+"""Largest size of a number, in any unit: no range or limit of a robot reaches further."""
+_PRINTABLE = f"^[^{UNPRINTABLE}]+$"
+Name = Annotated[str, Field(min_length=1, max_length=100, pattern=_PRINTABLE)]
+File = Annotated[str, Field(min_length=1, max_length=4096, pattern=_PRINTABLE)]
+Unit = Annotated[str, Field(max_length=40, pattern=f"^[^{UNPRINTABLE}]*$")]
+Finite = Annotated[float, Field(allow_inf_nan=False, ge=-LARGEST, le=LARGEST)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, le=LARGEST)]
+
+
+class Part(BaseModel):
+    """A part of a file: no unknown key is accepted, and no value is converted into another type."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+
+def refuse(wrong: bool, sentence: str) -> None:
+    """Raise a ValueError, which pydantic reports, where something is wrong."""
+    if wrong:
+        raise ValueError(sentence)
+
+
+@contextmanager
+def refused_with_line(document: Document, whole: type, parts: Mapping[str | int, type]) -> Iterator[None]:
+    """Turn pydantic's refusal inside the block into an error with the line of the first mistake.
+
+    Args:
+        document: The file that was validated.
+        whole: The model of the file.
+        parts: The models of its parts by their key, for the keys that each may have.
+    """
+    try:
+        yield
+    except ValidationError as error:
+        # What is missing may be there under a misspelt name, which says more.
+        details = sorted(
+            error.errors(), key=lambda detail: (detail["type"] == "missing", document.line(_place(detail)))
+        )
+        more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
+        place = _place(details[0])
+        part = next((parts[key] for key in reversed(place[:-1]) if key in parts), whole)
+        raise document.error(place, mistake(details[0], place, _keys(part)) + more) from error
+
+
+def mistake(detail: ErrorDetails, place: Place, known: list[str]) -> str:
+    """A finding of pydantic in words: what was expected, where, and what was there instead.
+
+    Args:
+        detail: The finding.
+        place: Where it is, by the keys of the file.
+        known: The keys that the part around it may have.
+    """
+    kind, got = detail["type"], detail["input"]
+    what = ".".join(str(part) for part in place if not isinstance(part, int))
+    if kind in ("missing", "missing_argument"):
+        *around, key = place
+        return f"expected {key}: {'here' if not around else 'in this part of ' + str(around[0])}"
+    if kind in ("extra_forbidden", "unexpected_keyword_argument"):
+        return f"unknown key {place[-1]!r}; {nearest_hint(str(place[-1]), known)}"
+    if kind == "value_error":
+        return str(detail["ctx"]["error"])
+    if kind in ("string_type", "path_type") and isinstance(got, int | float):
+        return f"expected text in {what}, got {got!r}; put it in quotes"
+    expected = detail["msg"].partition(" should ")[2].partition(" after ")[0].removeprefix("be ").removeprefix("have ")
+    expected = _WORDS.get(kind, expected)
+    if kind == "string_pattern_mismatch" and place == ("name",):
+        expected = "a name of letters, digits, _ . and -"
+    return f"expected {expected} in {what}, got {shown(got)}"
+
+
+def _keys(part: type) -> list[str]:
+    """The keys that a part of a file may have."""
+    if is_dataclass(part):
+        return [row.name for row in fields(part)]
+    return list(getattr(part, "model_fields", ()))
+
+
+def _place(detail: ErrorDetails) -> Place:
+    """The place of an error in the document, without pydantic's mark for a key of a dictionary."""
+    return tuple(part for part in detail["loc"] if part != "[key]")
+
+
+def shown(value: object) -> str:
+    """A value of a file in a sentence."""
+    if isinstance(value, dict):
+        return "keys and values"
+    if value is None or value == []:
+        return "nothing" if value is None else "an empty list"
+    text = str(value) if isinstance(value, float) and not math.isfinite(value) else repr(value)
+    return text if len(text) <= 60 else text[:57] + "..."

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 from pydantic import Field, field_validator, model_validator
 
 from madoc.errors import listed
-from madoc.robots.validation import Finite, Name, Part, Positive, refuse
+from madoc.robots.document import Finite, Name, Part, Positive, refuse
 
 Share = Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, le=1e12, allow_inf_nan=False)]

@@ -10,11 +10,10 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from madoc.errors import MadocError
-from madoc.robots.expressions import Expression, Read
+from madoc.robots.expressions import Expression, Read, Scope, parse
 from madoc.robots.functions import NAMES, Argument, Function, read_functions
-from madoc.robots.grammar import Scope, parse
 from madoc.robots.model import Draft
-from madoc.robots.sensing import Layout, Signals, Span
+from madoc.robots.signals import Layout, Signals, Span
 from madoc.tasks.base import ActionChannel, Batch, never_terminated
 
 _OF_STATE = ("position", "velocity")

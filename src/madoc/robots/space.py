@@ -9,7 +9,7 @@ import mujoco
 
 from madoc.parameters import FIELDS, PAYLOAD, Parameter, ParameterSpace, field_of
 from madoc.robots.drives import friction_parameters
-from madoc.robots.grammar import parse
+from madoc.robots.expressions import parse
 from madoc.robots.model import Draft, is_slide
 from madoc.robots.signals import signal_unit
 from madoc.simulation.arrays import check_field

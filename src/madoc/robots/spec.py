@@ -8,9 +8,19 @@ from pydantic import BeforeValidator, Field, WithJsonSchema, field_validator, mo
 
 from madoc.errors import nearest_hint
 from madoc.parameters import FIELDS, INERTIA, Parameter
-from madoc.robots.document import Document, read_document
+from madoc.robots.document import (
+    Document,
+    File,
+    Finite,
+    Name,
+    Part,
+    Positive,
+    Unit,
+    read_document,
+    refuse,
+    refused_with_line,
+)
 from madoc.robots.drive_spec import ConditionSpec, DriveSpec, FrictionSpec, GearSpec
-from madoc.robots.validation import File, Finite, Name, Part, Positive, Unit, refuse, refused_with_line
 from madoc.tasks import TASKS
 
 SHORTEST_TIMESTEP = 1e-6

@@ -13,10 +13,9 @@ from jaxtyping import PRNGKeyArray
 from madoc import simulation
 from madoc.errors import MadocError
 from madoc.robots.actions import action_channel, added_actuator, idle_actuators
-from madoc.robots.drives import joint_frictions, with_inputs
+from madoc.robots.drives import check_gears, check_timestep, joint_frictions, with_inputs
 from madoc.robots.episodes import Episode, no_reward, read_episode
 from madoc.robots.functions import PythonFile
-from madoc.robots.gears import check_gears, check_timestep
 from madoc.robots.model import Draft, compiled, make_model, read_model, with_whole_inertia
 from madoc.robots.model_files import ModelFiles
 from madoc.robots.signals import attitudes_of, quaternion_of, read_signals, signal_unit, turn_of

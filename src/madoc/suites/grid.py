@@ -11,8 +11,7 @@ from typing import Literal
 from pydantic import Field
 
 from madoc.errors import MadocError
-from madoc.robots.document import Document, Place, read_document
-from madoc.robots.validation import Part, refused_with_line
+from madoc.robots.document import Document, Part, Place, read_document, refused_with_line
 
 GRID, ROBOTS, DATA = "grid", "robots", "data"
 """Keys of an entry that are no options: values to multiply out, and logs of several robots of one kind."""

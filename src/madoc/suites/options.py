@@ -11,7 +11,7 @@ from tyro.conf import Suppress
 
 from madoc.errors import MadocError, nearest_hint
 from madoc.pipeline.orders import CalibrationOrder, EvaluationOrder, PolicyOrder, RecordOrder
-from madoc.robots.validation import mistake, shown
+from madoc.robots.document import mistake, shown
 from madoc.suites.grid import RANGE
 
 Order = RecordOrder | CalibrationOrder | PolicyOrder | EvaluationOrder
