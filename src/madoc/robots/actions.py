@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from madoc.robots.drives import drive_numbers, encoder_tendon
+from madoc.robots.drives import drive_numbers, encoder_tendon, single_joint
 from madoc.robots.model import AddedActuator, Draft, is_slide
 from madoc.robots.spec import SCALES, ActionSpec
 from madoc.simulation.write import OF_A_JOINT
@@ -23,13 +23,8 @@ def added_actuator(draft: Draft, index: int) -> AddedActuator | None:
             raise document.unknown(place, "the name of an actuator", str(action.actuator), actuators)
         _check_free(draft, index)
         return None
-    place, joint = ("actions", index, "joint"), draft.base.joint(action.joint)
-    if joint is None:
-        joints = [joint.name for joint in draft.base.joints if joint.name]
-        raise document.unknown(place, "the name of a joint", action.joint, joints)
-    slide = joint.type == mujoco.mjtJoint.mjJNT_SLIDE
-    if not slide and joint.type != mujoco.mjtJoint.mjJNT_HINGE:
-        raise document.error(place, f"expected a hinge or a slide, got {action.joint!r}, which is a ball or free")
+    place = ("actions", index, "joint")
+    slide = single_joint(draft, place, action.joint).type == mujoco.mjtJoint.mjJNT_SLIDE
     if action.drive is not None and slide:
         raise document.error(place, f"expected a hinge beside drive:, got {action.joint!r}, which is a slide")
     if action.means == ("torque" if slide else "force"):
