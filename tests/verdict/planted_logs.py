@@ -9,9 +9,8 @@ import numpy as np
 from madoc import simulation
 from madoc.calibration import CalibrationProblem, LeastSquares, calibrate
 from madoc.data import Disturbance, disturb
-from madoc.data.dataset import close_episodes
+from madoc.data.dataset import close_episodes, hold_out
 from madoc.data.record import record
-from madoc.data.split import hold_out
 from madoc.types import Transitions
 from madoc.verdict import Bench, assess
 from robots import ARM_TRUTH, SPRING_TRUTH, recorded, spring, two_link_arm

@@ -12,8 +12,8 @@ from planted_logs import ROBOTS, log_of
 import madoc
 from madoc import robots, simulation
 from madoc.calibration import CalibrationProblem, CalibrationResult, LeastSquares
+from madoc.data.dataset import hold_out
 from madoc.data.findings import Finding
-from madoc.data.split import hold_out
 from madoc.errors import MadocError
 from madoc.identification.candidate_terms import INTEGRATION
 from madoc.identification.term_tests import Alternative, Suspicions

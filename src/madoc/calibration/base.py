@@ -55,7 +55,7 @@ class CalibrationProblem:
 
     @cached_property
     def typical_change(self) -> Float[np.ndarray, " observation"]:
-        """Standard deviation of each channel's change in a stride of rows, as `data.timescale.typical_change`."""
+        """Standard deviation of each channel's change in a stride of rows, as `data.dataset.typical_change`."""
         return typical_change(self.dataset, self.simulator.task.attitudes)
 
     @cached_property

@@ -29,7 +29,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class PredictionError:
-    """Mean absolute error of predictions, each signal in units of its typical change in a stride (`data.timescale`).
+    """Mean absolute error of predictions, each signal in units of its typical change in a stride (`data.stride`).
 
     Attributes:
         steps: Horizon of the predictions in control steps.

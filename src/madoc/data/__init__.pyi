@@ -1,6 +1,8 @@
 from . import logs as logs
 from .dataset import Dataset as Dataset
+from .dataset import stride as stride
 from .dataset import subsample as subsample
+from .dataset import typical_change as typical_change
 from .disturbance import Disturbance as Disturbance
 from .disturbing import disturb as disturb
 from .disturbing import hide_velocities as hide_velocities
@@ -9,6 +11,4 @@ from .formats import FORMATS as FORMATS
 from .formats import Format as Format
 from .formats import load as load
 from .native import save as save
-from .timescale import stride as stride
-from .timescale import typical_change as typical_change
 from .validation import validate as validate

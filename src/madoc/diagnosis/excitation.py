@@ -28,7 +28,7 @@ from madoc.simulation.base import Simulator
 from madoc.simulation.response import mass_like
 
 WINDOWS = {3: 300, 20: 60}
-"""Largest number of windows, by their length in strides (`data.timescale`). Long ones narrow the intervals where
+"""Largest number of windows, by their length in strides (`data.dataset.stride`). Long ones narrow the intervals where
 sensors are noisy, short ones where the robot is chaotic."""
 FEW = 100
 """Largest number of short windows where no intervals are wanted."""

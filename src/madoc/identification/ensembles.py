@@ -12,9 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from madoc.data.dataset import Dataset
+from madoc.data.dataset import Dataset, stride
 from madoc.data.disturbing import hide_velocities
-from madoc.data.timescale import stride
 from madoc.data.velocities import moving_states
 from madoc.identification.innovations import Innovations, innovations
 from madoc.identification.noise import difference_noise

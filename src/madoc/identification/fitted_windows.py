@@ -6,8 +6,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from madoc.data.dataset import Dataset
-from madoc.data.timescale import stride
+from madoc.data.dataset import Dataset, stride
 from madoc.identification.ensembles import with_contacts_settled
 from madoc.identification.gauss_newton import (
     DAMPING,

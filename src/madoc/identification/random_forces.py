@@ -9,8 +9,7 @@ inertia J, is normal with a standard deviation of s √J, and so changes the kin
 import numpy as np
 from jaxtyping import Float
 
-from madoc.data.dataset import Dataset
-from madoc.data.timescale import stride
+from madoc.data.dataset import Dataset, stride
 from madoc.identification.states import LoggedStates
 from madoc.simulation.base import Simulator
 

@@ -8,13 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 
-from madoc.data.dataset import Dataset
-from madoc.data.timescale import stride
+from madoc.data.dataset import Dataset, stride
 from madoc.errors import MadocError
 from madoc.types import generator
 
 HORIZONS = (1, 5, 20)
-"""Window lengths in strides (`data.timescale`) at which simulated and logged motion are compared; the last is the
+"""Window lengths in strides (`data.dataset.stride`) at which simulated and logged motion are compared; the last is the
 robot's time scale where the log's rate is high. Most methods fit single steps; an error that is small in each of them
 adds up."""
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from madoc import simulation
 from madoc.calibration import CALIBRATORS, CalibrationProblem
 from madoc.data import Dataset, observed_task
-from madoc.data.split import hold_out
+from madoc.data.dataset import hold_out
 from madoc.diagnosis import check, refuse_fatal
 from madoc.pipeline.data_stage import Machine, fingerprint, load_source, read_truth
 from madoc.pipeline.keys import stage_key

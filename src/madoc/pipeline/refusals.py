@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from madoc.data.split import check_share
+from madoc.data.dataset import check_share
 from madoc.errors import MadocError, unknown_name
 from madoc.pipeline.keys import check_seed
 from madoc.pipeline.orders import AUTO, CalibrationOrder, Drawing, Search

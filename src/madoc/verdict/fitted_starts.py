@@ -123,7 +123,7 @@ def fitted_replays_of(
 
     They are at most `most`; without that `MOST`, and as many as share no row on average, or the fewest.
 
-    `stride` is the number of control steps between readings at which the robot has moved, `data.timescale.stride`.
+    `stride` is the number of control steps between readings at which the robot has moved, `data.dataset.stride`.
     `ahead` are control steps after the fitted ones, `AHEAD` strides where none are given.
     """
     logged = states_of(held, simulator)
