@@ -16,7 +16,8 @@ from logged_arm import ACTIONS, SIGNALS, arm_of, assert_same, matrix, named, wri
 
 from madoc.data import logs
 from madoc.data.findings import Finding
-from madoc.data.logs import mcap_reader, parquet_reader
+from madoc.data.logs import parquet_reader
+from madoc.data.logs.messages import read_mcap
 from madoc.errors import MadocError
 
 
@@ -235,11 +236,11 @@ def test_a_zip_archive_of_other_files_is_refused(robot, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("reader", "package", "file"),
-    [(parquet_reader, "pyarrow", "log.parquet"), (mcap_reader, "mcap.reader", "log.mcap")],
+    ("read", "package", "file"),
+    [(parquet_reader.read, "pyarrow", "log.parquet"), (read_mcap, "mcap.reader", "log.mcap")],
 )
-def test_a_missing_extra_names_its_command(tmp_path, monkeypatch, reader, package, file):
+def test_a_missing_extra_names_its_command(tmp_path, monkeypatch, read, package, file):
     monkeypatch.setitem(sys.modules, package, None)
     (tmp_path / file).write_bytes(b"anything")
     with pytest.raises(MadocError, match=r'pip install "madoc-calibration\[logs\]"'):
-        reader.read(tmp_path / file, ())
+        read(tmp_path / file, ())

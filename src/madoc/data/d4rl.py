@@ -8,10 +8,9 @@ import h5py
 import numpy as np
 from jaxtyping import Bool, Float
 
+from madoc.data.archives import opened, size_of
 from madoc.data.dataset import Dataset, close_episodes, starts_after
-from madoc.data.hdf5 import opened, size_of
-from madoc.data.sizes import LARGEST_DATASET, check_size
-from madoc.data.validation import as_matrix, as_transitions, require_arrays, validate
+from madoc.data.validation import LARGEST_DATASET, as_matrix, as_transitions, check_size, require_arrays, validate
 from madoc.errors import MadocError
 from madoc.tasks import Task
 

@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING
 import h5py
 import numpy as np
 
+from madoc.data.archives import opened, size_of
 from madoc.data.dataset import Dataset, close_episodes, join
-from madoc.data.hdf5 import opened, size_of
-from madoc.data.sizes import LARGEST_DATASET, check_size
-from madoc.data.validation import as_matrix, as_transitions, validate
+from madoc.data.validation import LARGEST_DATASET, as_matrix, as_transitions, check_size, validate
 from madoc.errors import MadocError
 from madoc.tasks import Task
 from madoc.types import Transitions

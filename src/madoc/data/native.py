@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 from pydantic import TypeAdapter
 
+from madoc.data.archives import holds, read_arrays
 from madoc.data.dataset import Dataset
 from madoc.data.disturbance import Disturbance
 from madoc.data.disturbing import observed_task
 from madoc.data.findings import Finding
-from madoc.data.npz import holds, read_arrays
 from madoc.data.validation import NAMES, as_transitions, require_arrays, validate
 from madoc.errors import MadocError
 from madoc.parameters import FIELDS

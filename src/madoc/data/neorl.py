@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
+from madoc.data.archives import holds, read_arrays
 from madoc.data.dataset import Dataset, close_episodes
-from madoc.data.npz import holds, read_arrays
 from madoc.data.validation import NAMES, as_matrix, as_transitions, as_vector, require_arrays, validate
 from madoc.errors import MadocError
 from madoc.tasks import Task

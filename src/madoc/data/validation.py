@@ -12,6 +12,22 @@ from madoc.errors import MadocError
 from madoc.tasks import Task
 from madoc.types import Transitions
 
+LARGEST = 500_000_000
+"""Largest size of what is read of one log, bytes in memory: four million rows of twelve numbers, and a clock."""
+LARGEST_OF_ALL = 2_000_000_000
+"""Largest size of what is read of all logs together, bytes in memory."""
+LARGEST_DATASET = 4_000_000_000
+"""Largest size of a data set of one of Madoc's own robots, bytes in memory: two million rows of an Ant have half."""
+
+
+def check_size(size: int, what: str, most: int) -> None:
+    """Refuse what would take more memory than a bound, bytes, before it is read."""
+    if size > most:
+        raise MadocError(
+            f"{what} take {size:,} bytes of memory or more, at most {most:,} are read; split the log or record less"
+        )
+
+
 ACTION_TOLERANCE = 1e-5
 """Distance of an action from [-1, 1], up to which it is clipped silently as a rounding error; beyond, it is refused."""
 FLOATS = ("observation", "action", "reward", "next_observation")

@@ -13,7 +13,7 @@ from ruamel.yaml.error import YAMLError
 
 from madoc.calibration.holdout import HoldOut
 from madoc.calibration.result import CalibrationResult, ParameterEstimate
-from madoc.data.npz import unpack
+from madoc.data.archives import unpack
 from madoc.errors import MadocError
 from madoc.report.records import EvaluationRecord, SpecRecord, read_object, read_record, read_spec
 from madoc.robots.document import yaml_text
@@ -71,7 +71,7 @@ class Evidence:
         signals: Names of the signals.
         names: Names of the runs.
         fitted: Number of rows to which the start of each run was fitted; 0 where it is the first logged state.
-        scale: Typical change of each signal in a stride of rows (`data.timescale`), in its unit.
+        scale: Typical change of each signal in a stride of rows (`data.dataset.stride`), in its unit.
         time: Time since the beginning of a run, s.
         measured: What was logged.
         before: Simulated in the model as given.

@@ -7,27 +7,18 @@ import os
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 from madoc.data.dataset import Dataset
 from madoc.data.findings import Finding
-from madoc.data.logs import (
-    csv_reader,
-    hdf5_reader,
-    lerobot_reader,
-    mcap_reader,
-    minari_runs,
-    parquet_reader,
-    rosbag_reader,
-)
+from madoc.data.logs import csv_reader, parquet_reader
+from madoc.data.logs.array_readers import read_hdf5, read_minari, read_npz
 from madoc.data.logs.assembly import assemble, wanted_columns
 from madoc.data.logs.jumps import split_episodes, without_copies
-from madoc.data.logs.tables import Run, Stored, asked_tables
+from madoc.data.logs.messages import read_bag, read_mcap
+from madoc.data.logs.tables import Run
 from madoc.data.minari_reader import recognises as is_minari
-from madoc.data.npz import read_array, read_headers, require_npz
-from madoc.data.sizes import LARGEST_OF_ALL, check_size
-from madoc.data.validation import require_file, validate
+from madoc.data.validation import LARGEST_OF_ALL, check_size, require_file, validate
 from madoc.errors import MadocError, listed
 from madoc.robots import Robot
 
@@ -46,24 +37,15 @@ class LogFormat:
     suffixes: tuple[str, ...]
 
 
-def _read_npz(path: Path, wanted: Collection[str]) -> list[Run]:
-    require_npz(path)
-    arrays = {
-        name: Stored(header.shape, header.dtype, header.size, partial(read_array, path, name))
-        for name, header in read_headers(path).items()
-    }
-    return [Run(path.name, asked_tables(arrays, wanted, path.name))]
-
-
 LOG_FORMATS: dict[str, LogFormat] = {
     "csv": LogFormat(csv_reader.read, (".csv", ".tsv", ".txt")),
-    "npz": LogFormat(_read_npz, (".npz",)),
-    "hdf5": LogFormat(hdf5_reader.read, (".h5", ".hdf5", ".hdf")),
+    "npz": LogFormat(read_npz, (".npz",)),
+    "hdf5": LogFormat(read_hdf5, (".h5", ".hdf5", ".hdf")),
     "parquet": LogFormat(parquet_reader.read, (".parquet", ".pq")),
-    "mcap": LogFormat(mcap_reader.read, (".mcap",)),
-    "rosbag": LogFormat(rosbag_reader.read, (".db3",)),
-    "minari": LogFormat(minari_runs.read, ()),
-    "lerobot": LogFormat(lerobot_reader.read, ()),
+    "mcap": LogFormat(read_mcap, (".mcap",)),
+    "rosbag": LogFormat(read_bag, (".db3",)),
+    "minari": LogFormat(read_minari, ()),
+    "lerobot": LogFormat(parquet_reader.read_lerobot, ()),
 }
 
 _BY_SUFFIX = {suffix: entry for entry in LOG_FORMATS.values() for suffix in entry.suffixes}
@@ -123,7 +105,7 @@ def files_of(folder: Path) -> list[Path]:
         for file in folder.rglob("*")
         if file.is_file() and not any(part.startswith(".") for part in file.relative_to(folder).parts)
     )
-    if lerobot_reader.recognises(folder) or is_minari(folder):
+    if parquet_reader.is_lerobot(folder) or is_minari(folder):
         return visible
     return [
         file
@@ -142,7 +124,7 @@ def _runs(source: Path, wanted: Collection[str]) -> tuple[list[Run], list[str]]:
         if entry is None:
             raise MadocError(f"expected a log that ends in {_SUFFIX_LIST}, got {source}; convert it to CSV, say")
         return entry.read(source, wanted), []
-    if lerobot_reader.recognises(source):
+    if parquet_reader.is_lerobot(source):
         return LOG_FORMATS["lerobot"].read(source, wanted), []
     if is_minari(source):
         return LOG_FORMATS["minari"].read(source, wanted), []

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from madoc.data.logs.tables import MISSING, WIDEST, Run, Table
-from madoc.data.sizes import LARGEST, check_size
+from madoc.data.validation import LARGEST, check_size
 from madoc.errors import MadocError
 
 SEPARATORS = (",", ";", "\t")

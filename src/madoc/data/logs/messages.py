@@ -1,15 +1,18 @@
-"""Messages of robot middleware, JSON or ROS 2, as columns: a table for each topic, each with its own clock."""
+"""Messages of robot middleware, JSON or ROS 2, in MCAP or bags: a table for each topic, each with its own clock."""
 
 import json
+import sqlite3
 from array import array
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
+from urllib.parse import quote
 
 import numpy as np
 
 from madoc.data.logs.tables import WIDEST, Run, Table
-from madoc.data.sizes import LARGEST, check_size
+from madoc.data.validation import LARGEST, check_size
 from madoc.errors import MadocError
 
 CLOCK = "log_time"
@@ -206,3 +209,94 @@ def _table(name: str, topic: _Topic, origin: int, others: Mapping[str, str]) -> 
         if None not in times:
             columns[clock] = (np.array(times, dtype=np.int64) - origin) / 1e9
     return Table(columns, CLOCK, others=others, unread=[key for key in topic.names if key not in columns])
+
+
+if TYPE_CHECKING:
+    from mcap.records import Chunk
+
+LARGEST_CHUNK = 200_000_000
+"""Largest size of a chunk, bytes when unpacked; recorders write chunks of a million or less."""
+_MOST_OF_LZ4 = 255
+"""Largest ratio by which LZ4 packs."""
+
+
+def read_mcap(path: Path, wanted: Collection[str]) -> list[Run]:
+    """One run with a table for each topic, as `run_of` makes them."""
+    return [run_of(path, _messages_of_mcap(path), wanted)]
+
+
+def _messages_of_mcap(path: Path) -> Iterator[Message]:
+    try:
+        from mcap.reader import make_reader
+    except ImportError as error:
+        raise MadocError(f"MCAP logs need the library mcap: {EXTRA} ({error})") from error
+    try:
+        with path.open("rb") as file:
+            _check_chunks(file)
+            file.seek(0)
+            for schema, channel, found in make_reader(file, validate_crcs=True).iter_messages():
+                kind = Kind(channel.message_encoding)
+                if schema is not None and kind.encoding == "cdr":
+                    kind = Kind("cdr", schema.name, schema.data.decode(), schema.encoding == "ros2idl")
+                yield Message(channel.topic, kind, found.data, found.log_time, found.publish_time)
+    except Exception as error:  # the reader passes on what its decompressors and unpackers raise
+        raise MadocError(
+            f"cannot read {path.name} as MCAP ({type(error).__name__}: {error}); it is damaged or was cut short, "
+            "`mcap recover` may save it"
+        ) from error
+
+
+def _check_chunks(file: BinaryIO) -> None:
+    """Refuse, by a ValueError, a chunk that unpacks to more than any recorder writes."""
+    from mcap.records import Chunk
+    from mcap.stream_reader import StreamReader
+
+    for record in StreamReader(file, emit_chunks=True, record_size_limit=LARGEST_CHUNK).records:
+        if isinstance(record, Chunk) and _unpacked_size(record) > LARGEST_CHUNK:
+            raise ValueError(f"a chunk unpacks to more than {LARGEST_CHUNK:,} bytes")
+
+
+def _unpacked_size(chunk: "Chunk") -> int:
+    """Size in bytes to which a chunk unpacks at most; no more than the bound is unpacked to know it."""
+    if chunk.compression == "zstd":
+        import zstandard
+
+        told = zstandard.get_frame_parameters(chunk.data).content_size
+        return chunk.uncompressed_size if told == zstandard.CONTENTSIZE_UNKNOWN else max(told, chunk.uncompressed_size)
+    if chunk.compression == "lz4" and len(chunk.data) > LARGEST_CHUNK // _MOST_OF_LZ4:
+        from lz4.frame import LZ4FrameDecompressor
+
+        return len(LZ4FrameDecompressor().decompress(chunk.data, max_length=LARGEST_CHUNK + 1))
+    return 0
+
+
+_ROWS_OF_BAG = """
+SELECT topics.name, topics.type, topics.serialization_format, messages.timestamp, messages.data
+FROM messages JOIN topics ON messages.topic_id = topics.id ORDER BY messages.timestamp, messages.id
+"""
+_DEFINITIONS = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+
+
+def read_bag(path: Path, wanted: Collection[str]) -> list[Run]:
+    """One run with a table for each topic, as `run_of` makes them; a bag knows one time of a message."""
+    return [run_of(path, _messages_of_bag(path), wanted)]
+
+
+def _messages_of_bag(path: Path) -> Iterator[Message]:
+    """The messages in the order of their times; the file is only read, and no journal beside it."""
+    try:
+        connection = sqlite3.connect(f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1", uri=True)
+        try:
+            connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST_CHUNK)
+            tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+            rows = connection.execute(_DEFINITIONS) if "message_definitions" in tables else ()
+            defined = {name: (text, encoding == "ros2idl") for name, encoding, text in rows}
+            for topic, name, encoding, time, data in connection.execute(_ROWS_OF_BAG):
+                yield Message(topic, Kind(encoding, name, *defined.get(name, ())), data, time, time)
+        finally:
+            connection.close()
+    except (sqlite3.Error, OverflowError) as error:
+        raise MadocError(
+            f"cannot read {path.name} as a ROS 2 bag ({error}); it is damaged, was cut short or is packed: "
+            "`ros2 bag convert` may save or unpack it"
+        ) from error

@@ -1,12 +1,13 @@
 """The result of every reader of logs: runs, each with tables of named columns."""
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from madoc.data.sizes import LARGEST, check_size
+from madoc.data.archives import Stored
+from madoc.data.validation import LARGEST, check_size
 from madoc.errors import MadocError
 
 WIDEST = 1000
@@ -70,23 +71,6 @@ class Run:
     def names(self) -> list[str]:
         """Names of all columns that can be read."""
         return list(dict.fromkeys(name for table in self.tables for name in (*table.columns, *table.unread)))
-
-
-@dataclass(frozen=True)
-class Stored:
-    """An array of a file that has not been read.
-
-    Attributes:
-        shape: Its shape.
-        dtype: Kind of its values.
-        size: Its size in memory, bytes; for values of any length at least.
-        read: Reads it.
-    """
-
-    shape: tuple[int, ...]
-    dtype: np.dtype
-    size: int
-    read: Callable[[], np.ndarray]
 
 
 def is_asked(name: str, wanted: Collection[str]) -> bool:
