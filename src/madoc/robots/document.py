@@ -5,10 +5,10 @@ Pydantic's findings in such a document are each one sentence with that line.
 
 import io
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, is_dataclass
-from typing import Annotated
+from dataclasses import dataclass
+from typing import Annotated, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
@@ -225,14 +225,8 @@ def refuse(wrong: bool, sentence: str) -> None:
 
 
 @contextmanager
-def refused_with_line(document: Document, whole: type, parts: Mapping[str | int, type]) -> Iterator[None]:
-    """Turn pydantic's refusal inside the block into an error with the line of the first mistake.
-
-    Args:
-        document: The file that was validated.
-        whole: The model of the file.
-        parts: The models of its parts by their key, for the keys that each may have.
-    """
+def refused_with_line(document: Document, whole: type[BaseModel]) -> Iterator[None]:
+    """Turn pydantic's refusal of a file of this model inside the block into an error with the first mistake's line."""
     try:
         yield
     except ValidationError as error:
@@ -242,8 +236,11 @@ def refused_with_line(document: Document, whole: type, parts: Mapping[str | int,
         )
         more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
         place = _place(details[0])
-        part = next((parts[key] for key in reversed(place[:-1]) if key in parts), whole)
-        raise document.error(place, mistake(details[0], place, _keys(part)) + more) from error
+        for key in place[:-1]:
+            field = whole.model_fields.get(str(key))
+            kinds = () if field is None else (field.annotation, *get_args(field.annotation))
+            whole = next((kind for kind in kinds if isinstance(kind, type) and issubclass(kind, BaseModel)), whole)
+        raise document.error(place, mistake(details[0], place, list(whole.model_fields)) + more) from error
 
 
 def mistake(detail: ErrorDetails, place: Place, known: list[str]) -> str:
@@ -270,13 +267,6 @@ def mistake(detail: ErrorDetails, place: Place, known: list[str]) -> str:
     if kind == "string_pattern_mismatch" and place == ("name",):
         expected = "a name of letters, digits, _ . and -"
     return f"expected {expected} in {what}, got {shown(got)}"
-
-
-def _keys(part: type) -> list[str]:
-    """The keys that a part of a file may have."""
-    if is_dataclass(part):
-        return [row.name for row in fields(part)]
-    return list(getattr(part, "model_fields", ()))
 
 
 def _place(detail: ErrorDetails) -> Place:

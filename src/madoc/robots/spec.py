@@ -252,25 +252,11 @@ class RobotSpec(Part):
         return name
 
 
-_PARTS: dict[str | int, type] = {
-    "signals": SignalSpec,
-    "actions": ActionSpec,
-    "drive": DriveSpec,
-    "friction": FrictionSpec,
-    "gears": GearSpec,
-    "conditions": ConditionSpec,
-    "parameters": ParameterSpec,
-    "log": LogSpec,
-    "goals": GoalSpec,
-}
-"""The parts of the spec by their key, for the keys that each may have."""
-
-
 @lru_cache(maxsize=32)
 def read_spec(content: bytes, file: str) -> tuple[RobotSpec, Document]:
     """A spec and the lines of its parts, parsed once; the first mistake is refused with its line."""
     document = read_document(content, file)
     if not isinstance(document.data, dict):
         raise document.error((), "expected keys and values, as `name: my_robot`; write one with: madoc init MODEL")
-    with refused_with_line(document, RobotSpec, _PARTS):
+    with refused_with_line(document, RobotSpec):
         return RobotSpec.model_validate(document.data), document

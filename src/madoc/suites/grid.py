@@ -62,7 +62,7 @@ def read_suite(path: Path) -> tuple[SuiteFile, Document]:
     )
     if not isinstance(document.data, dict):
         raise document.error((), "expected keys and values, `madoc: 1` and `cells:`")
-    with refused_with_line(document, SuiteFile, {}):
+    with refused_with_line(document, SuiteFile):
         return SuiteFile.model_validate(document.data), document
 
 
