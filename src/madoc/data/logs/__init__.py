@@ -6,7 +6,7 @@ Each format has one reader, which returns runs of named columns; `assembly.py` m
 import os
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from madoc.data.dataset import Dataset
@@ -22,34 +22,17 @@ from madoc.data.validation import LARGEST_OF_ALL, check_size, require_file, vali
 from madoc.errors import MadocError, listed
 from madoc.robots import Robot
 
-
-@dataclass(frozen=True)
-class LogFormat:
-    """A layout of logs.
-
-    Attributes:
-        read: (path, wanted columns) -> runs, which may have other columns too. A file that is damaged, too large or of
-            another layout raises a MadocError, as does a library that is not installed.
-        suffixes: Endings of its files; empty where it is a folder.
-    """
-
-    read: Callable[[Path, Collection[str]], list[Run]]
-    suffixes: tuple[str, ...]
-
-
-LOG_FORMATS: dict[str, LogFormat] = {
-    "csv": LogFormat(csv_reader.read, (".csv", ".tsv", ".txt")),
-    "npz": LogFormat(read_npz, (".npz",)),
-    "hdf5": LogFormat(read_hdf5, (".h5", ".hdf5", ".hdf")),
-    "parquet": LogFormat(parquet_reader.read, (".parquet", ".pq")),
-    "mcap": LogFormat(read_mcap, (".mcap",)),
-    "rosbag": LogFormat(read_bag, (".db3",)),
-    "minari": LogFormat(read_minari, ()),
-    "lerobot": LogFormat(parquet_reader.read_lerobot, ()),
+_READERS: dict[str, Callable[[Path, Collection[str]], list[Run]]] = {
+    **dict.fromkeys((".csv", ".tsv", ".txt"), csv_reader.read),
+    ".npz": read_npz,
+    **dict.fromkeys((".h5", ".hdf5", ".hdf"), read_hdf5),
+    **dict.fromkeys((".parquet", ".pq"), parquet_reader.read),
+    ".mcap": read_mcap,
+    ".db3": read_bag,
 }
-
-_BY_SUFFIX = {suffix: entry for entry in LOG_FORMATS.values() for suffix in entry.suffixes}
-_SUFFIX_LIST = ", ".join(_BY_SUFFIX)
+"""By the ending of a file: (path, wanted columns) -> runs, which may have other columns too. A file that is damaged,
+too large or of another layout raises a MadocError, as does a library that is not installed."""
+_SUFFIX_LIST = ", ".join(_READERS)
 _NOT_LOGS = frozenset((".yaml", ".yml", ".xml", ".urdf", ".md", ".json", ".pdf", ".png", ".jpg", ".stl", ".obj", ""))
 """Endings of files that are often kept beside logs; they are skipped without a note."""
 _PROSE = frozenset(("readme", "license", "notes", "changelog"))
@@ -120,22 +103,22 @@ def _runs(source: Path, wanted: Collection[str]) -> tuple[list[Run], list[str]]:
     """The runs of a file or folder, and the files in it that no reader reads."""
     if not source.is_dir():
         require_file(source)
-        entry = _BY_SUFFIX.get(source.suffix.lower())
-        if entry is None:
+        reader = _READERS.get(source.suffix.lower())
+        if reader is None:
             raise MadocError(f"expected a log that ends in {_SUFFIX_LIST}, got {source}; convert it to CSV, say")
-        return entry.read(source, wanted), []
+        return reader(source, wanted), []
     if parquet_reader.is_lerobot(source):
-        return LOG_FORMATS["lerobot"].read(source, wanted), []
+        return parquet_reader.read_lerobot(source, wanted), []
     if is_minari(source):
-        return LOG_FORMATS["minari"].read(source, wanted), []
+        return read_minari(source, wanted), []
     runs: list[Run] = []
     ignored: list[str] = []
     size = 0
     for file in files_of(source):
         name, suffix = file.relative_to(source).as_posix(), file.suffix.lower()
-        if suffix in _BY_SUFFIX:
+        if suffix in _READERS:
             require_file(file)
-            read_runs = _BY_SUFFIX[suffix].read(file, wanted)
+            read_runs = _READERS[suffix](file, wanted)
             runs += [replace(run, name=run.name.replace(file.name, name, 1)) for run in read_runs]
             size += sum(run.size for run in read_runs)
             check_size(size, f"the logs in {source}", LARGEST_OF_ALL)
