@@ -6,7 +6,7 @@ import numpy as np
 from madoc import robots, simulation
 from madoc.calibration import CalibrationProblem
 from madoc.calibration.calibrate import without_repeats
-from madoc.simulation.sensitivity import insensitive
+from madoc.simulation.response import insensitive
 from own_robots import CART, CART_SPEC, write_robot
 from robots import recorded
 

@@ -15,7 +15,7 @@ from madoc.diagnosis import check, refuse_fatal
 from madoc.diagnosis.excitation import excite
 from madoc.errors import MadocError
 from madoc.identification.states import states_of
-from madoc.simulation.sensitivity import refuse_insensitive
+from madoc.simulation.response import refuse_insensitive
 from robots import ARM, counted
 
 ROWS = 300

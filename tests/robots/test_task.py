@@ -17,7 +17,7 @@ from madoc.data import Dataset
 from madoc.errors import MadocError
 from madoc.identification.states import logged_states
 from madoc.simulation.cpu import CpuSimulator
-from madoc.simulation.sensitivity import insensitive
+from madoc.simulation.response import insensitive
 from madoc.types import Transitions
 from own_robots import ARM_SPEC, CART_SPEC, SPRING_SPEC, URDF, URDF_SPEC, task_of, write_robot
 from robots import spring, two_link_arm

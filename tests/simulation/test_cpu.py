@@ -11,7 +11,7 @@ from madoc.errors import MadocError
 from madoc.parameters import Parameter, ParameterSpace
 from madoc.robots import load
 from madoc.simulation.cpu import CpuSimulator, CpuSystem
-from madoc.simulation.drives import drive_forces
+from madoc.simulation.probes import drive_forces
 from own_robots import CART_SPEC, write_robot
 from robots import spring
 

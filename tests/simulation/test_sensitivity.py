@@ -7,7 +7,7 @@ import pytest
 from madoc.errors import MadocError
 from madoc.parameters import Parameter
 from madoc.simulation.cpu import CpuSimulator
-from madoc.simulation.sensitivity import insensitive, refuse_insensitive
+from madoc.simulation.response import insensitive, refuse_insensitive
 from robots import counted
 
 KEY = jax.random.key(0)

@@ -19,7 +19,7 @@ from madoc.runs.files import replacing
 from madoc.runs.machine import one_blas_thread
 from madoc.runs.run_folder import RunFolder
 from madoc.simulation.base import SIMULATED
-from madoc.simulation.sensitivity import refuse_insensitive
+from madoc.simulation.response import refuse_insensitive
 from madoc.simulation.write import nominal_values
 from madoc.tasks import Task
 from madoc.types import State, entry_of

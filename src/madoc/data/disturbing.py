@@ -10,7 +10,7 @@ from madoc.data.dataset import Dataset
 from madoc.data.disturbance import Disturbance
 from madoc.data.velocities import moving_states, show_velocities
 from madoc.errors import MadocError
-from madoc.simulation.velocities import missing_velocities, refuse_unseen_positions
+from madoc.simulation.unobserved import missing_velocities, refuse_unseen_positions
 from madoc.tasks import Task
 
 Observations = Float[jax.Array | np.ndarray, "rows observation"]

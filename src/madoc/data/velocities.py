@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 
 from madoc.data.dataset import Dataset
 from madoc.errors import MadocError
-from madoc.simulation.velocities import missing_velocities, velocities_between, with_velocities
+from madoc.simulation.unobserved import missing_velocities, velocities_between, with_velocities
 from madoc.tasks import Task
 
 

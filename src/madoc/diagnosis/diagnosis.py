@@ -27,7 +27,7 @@ from madoc.parameters import ParameterSpace
 from madoc.robots import Robot
 from madoc.simulation import Simulator
 from madoc.simulation.base import SIMULATED
-from madoc.simulation.sensitivity import insensitive
+from madoc.simulation.response import insensitive
 
 MOST_ALIKE = 4
 """Largest number of findings with the same advice that are printed; `--json` has all."""

@@ -1,9 +1,16 @@
 """A calibration out of Madoc: the model, what changed in it, ranges to randomize in, a policy for other runtimes."""
 
-from madoc.export.bam import bam_files, save_bam
 from madoc.export.draws import save_draws
 from madoc.export.onnx_policy import save_onnx
-from madoc.export.parameter_files import Exported, is_patch, save_patch, save_randomization, save_sysid_parameters
+from madoc.export.parameter_files import (
+    Exported,
+    bam_files,
+    is_patch,
+    save_bam,
+    save_patch,
+    save_randomization,
+    save_sysid_parameters,
+)
 from madoc.export.recording import save_recordings, serve_recordings
 from madoc.export.trainers import Robot, save_isaac_lab, save_mjlab
 

@@ -18,7 +18,7 @@ from madoc.robots.space import element_unit
 from madoc.simulation.base import Simulator
 from madoc.simulation.gears import deflections
 from madoc.simulation.inertials import off_centre
-from madoc.simulation.touching import touching_geoms
+from madoc.simulation.probes import touching_geoms
 from madoc.simulation.user_data import is_drive
 from madoc.simulation.write import body_reach, element_names, has_gain, heavy_bodies, linked_bodies, nominal_values
 

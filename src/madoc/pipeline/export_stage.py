@@ -42,8 +42,7 @@ from madoc.simulation.configuration import (
     physics_options,
     start_position,
 )
-from madoc.simulation.drawn import numbers_of_draws
-from madoc.simulation.mjcf import DRIVES, save_mjcf
+from madoc.simulation.mjcf import DRIVES, numbers_of_draws, save_mjcf
 from madoc.simulation.user_data import needs_callbacks
 from madoc.simulation.write import element_names, nominal_values
 

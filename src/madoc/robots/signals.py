@@ -18,7 +18,7 @@ from madoc.robots.expressions import Expression, Read, parse
 from madoc.robots.model import Draft, is_single, is_slide
 from madoc.robots.spec import SCALES
 from madoc.simulation.gears import SUFFIX, deflection_values
-from madoc.simulation.linear_sensors import linear_sensors
+from madoc.simulation.probes import linear_sensors
 from madoc.simulation.write import element_names
 from madoc.tasks.base import Batch
 

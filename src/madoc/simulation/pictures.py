@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from madoc.runs.machine import usable_cores
-from madoc.simulation.outlines import outlines
+from madoc.simulation.shapes import outlines
 
 LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}
 """The ways to OpenGL without a screen, as MuJoCo's `MUJOCO_GL` names them, and the library that each needs."""
