@@ -120,7 +120,7 @@ numbers of the gear behind a joint (`simulation/gears.py`); its backlash is the 
 """
 
 
-_KINDS = {
+KINDS_OF_ARRAYS = {
     **{kind: kind for kind in ("body", "geom", "site", "pair", "tendon", "actuator", "sensor")},
     **dict.fromkeys(("dof", "jnt", "qpos", "qpos0"), "joint"),
     "eq": "equality",
@@ -135,10 +135,10 @@ _AT_LEAST_0 = ("mass", "damping", "stiffness", "frictionloss", "armature", "fric
 def array_of(field: str) -> tuple[str, int | None]:
     """The array of a model, and the place in an element's row, that a field such as `geom_solref[0]` names."""
     found = _NUMBER.fullmatch(field)
-    if found is None or found["first"] not in _KINDS:
+    if found is None or found["first"] not in KINDS_OF_ARRAYS:
         raise MadocError(
             f"unknown parameter field {field!r}; {nearest_hint(field, FIELDS)}; or a number of MuJoCo's model as "
-            f"geom_solref[0], whose array begins with {'_, '.join(_KINDS)}."
+            f"geom_solref[0], whose array begins with {'_, '.join(KINDS_OF_ARRAYS)}."
         )
     return found["array"], None if found["index"] is None else int(found["index"])
 
@@ -154,7 +154,7 @@ def field_of(name: str) -> Field:
         return FIELDS[name]
     array, _ = array_of(name)
     first = array.partition(".")[0] if "." in array else array.partition("_")[0]
-    return Field(_KINDS[first], "", 0.0 if array.endswith(_AT_LEAST_0) else -np.inf)
+    return Field(KINDS_OF_ARRAYS[first], "", 0.0 if array.endswith(_AT_LEAST_0) else -np.inf)
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ def numbers_at(model: mujoco.MjModel, field: str, element: int) -> np.ndarray:
     array, index = array_of(field)
     if array.startswith("opt."):
         return np.atleast_1d(getattr(model.opt, array.removeprefix("opt.")))[index or 0 :][:1]
-    rows = getattr(model, array)[_rows(model, array, element)]
+    rows = getattr(model, array)[rows_of(model, array, element)]
     return rows if index is None else rows[:, index]
 
 
@@ -58,9 +58,8 @@ def check_field(model: mujoco.MjModel, field: str) -> None:
     owner, name = (model.opt, array.removeprefix("opt.")) if option else (model, array)
     held = getattr(owner, name, None) if hasattr(type(owner), name) else None
     if not isinstance(held, float) and not (isinstance(held, np.ndarray) and held.dtype.kind == "f" and held.size):
-        raise MadocError(
-            f"MuJoCo's model has no numbers {array!r}; {nearest_hint(name, _arrays(model, option=option))}"
-        )
+        known = option_names(model) if option else _array_names(model)
+        raise MadocError(f"MuJoCo's model has no numbers {array!r}; {nearest_hint(name, known)}")
     reason = _QUATERNION if array.endswith("quat") else _NOT_FREE.get(array)
     if reason is not None:
         raise MadocError(f"{array} cannot be calibrated: {reason}")
@@ -82,7 +81,7 @@ def check_written(model: mujoco.MjModel, field: str, element: int) -> None:
         raise MadocError(f"{field} cannot be calibrated: MuJoCo computes it from other numbers; calibrate those")
 
 
-def _rows(model: mujoco.MjModel, array: str, element: int) -> slice:
+def rows_of(model: mujoco.MjModel, array: str, element: int) -> slice:
     """The rows of an element in an array; a joint has one for each position or degree of freedom where those count."""
     if array.startswith("dof_"):
         return slice(model.jnt_dofadr[element], model.jnt_dofadr[element] + len(model.joint(element).damping))
@@ -91,13 +90,13 @@ def _rows(model: mujoco.MjModel, array: str, element: int) -> slice:
     return slice(element, element + 1)
 
 
-def _arrays(model: mujoco.MjModel, *, option: bool) -> list[str]:
-    """Names of the arrays of a model, or of its options, that have an element's number."""
-    if option:
-        return [name for name in dir(model.opt) if isinstance(getattr(model.opt, name), float | np.ndarray)]
-    found = []
-    for name in dir(model):
-        held = getattr(model, name)
-        if not name.startswith("_") and isinstance(held, np.ndarray) and held.dtype.kind == "f":
-            found.append(name)
-    return found
+def option_names(model: mujoco.MjModel) -> list[str]:
+    """Names of the options of a model that are floating-point numbers."""
+    return [name for name in dir(model.opt) if isinstance(getattr(model.opt, name), float | np.ndarray)]
+
+
+def _array_names(model: mujoco.MjModel) -> list[str]:
+    """Names of the arrays of a model that have an element's number."""
+    public = [name for name in dir(model) if not name.startswith("_")]
+    arrays = {name: getattr(model, name) for name in public}
+    return [name for name, held in arrays.items() if isinstance(held, np.ndarray) and held.dtype.kind == "f"]

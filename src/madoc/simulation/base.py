@@ -37,7 +37,6 @@ class System(Protocol):
 
         `force` acts on each degree of freedom from outside all the while, in N or N·m.
         """
-        ...
 
     def roll_out(
         self,
@@ -51,11 +50,9 @@ class System(Protocol):
         solver, which starts each step of a rollout from the solution of the step before. `force` is what acts on each
         degree of freedom from outside during each of the steps, in N or N·m.
         """
-        ...
 
     def observe(self, state: Float[np.ndarray, "systems rows state"]) -> Float[np.ndarray, "systems rows observation"]:
         """Observations of these states with the bias of each system's sensors; NaN where a state is NaN."""
-        ...
 
     def actuator_forces(
         self, state: Float[np.ndarray, "systems rows state"], action: Float[np.ndarray, "systems rows action"]
@@ -64,15 +61,12 @@ class System(Protocol):
 
         Late actions count as late.
         """
-        ...
 
     def unbiased(self, state: Float[np.ndarray, "systems rows state"]) -> Float[np.ndarray, "systems rows state"]:
         """States rebuilt from logged observations, corrected for the bias of each system's sensors."""
-        ...
 
     def replaced(self, systems: Int[np.ndarray, " some"], parameters: Float[np.ndarray, "some parameters"]) -> "System":
         """These systems, with those of the given indices bound to other physical values."""
-        ...
 
 
 @runtime_checkable
@@ -94,11 +88,9 @@ class Simulator(Protocol):
     @property
     def initial_state(self) -> Float[np.ndarray, " state"]:
         """State at the start of an episode, before the noise of a reset."""
-        ...
 
     def bind(self, parameters: Float[np.ndarray, "*systems parameters"] | Mapping[str, float]) -> System:
         """Dynamics at physical values: those of one system, by name or as a vector, or of one system in each row."""
-        ...
 
     def contacts(
         self, state: Float[np.ndarray, "rows state"], values: Float[np.ndarray, " parameters"] | None = None
@@ -107,8 +99,6 @@ class Simulator(Protocol):
 
         No parameter changes the shape of a body; only `jnt_ref` changes where positions place it.
         """
-        ...
 
     def model(self, values: Float[np.ndarray, " parameters"]) -> mujoco.MjModel:
         """The MuJoCo model at the given physical values, to export; owned by the caller."""
-        ...

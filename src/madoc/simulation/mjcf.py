@@ -13,8 +13,10 @@ import numpy as np
 from jaxtyping import Float, Int, Num
 
 from madoc.errors import MadocError
+from madoc.parameters import KINDS_OF_ARRAYS
 from madoc.runs.files import replacing
 from madoc.simulation import callbacks
+from madoc.simulation.arrays import option_names, rows_of
 from madoc.simulation.base import Simulator
 from madoc.simulation.user_data import needs_callbacks
 from madoc.simulation.write import write_parameters
@@ -122,7 +124,7 @@ def _refuse_difference(wanted: mujoco.MjModel, got: mujoco.MjModel, where: str) 
                 f"the model {where} differs from the bound one in {name} by {difference:.3g}; "
                 "this parameter, or this version of MuJoCo, cannot be written as MJCF exactly"
             )
-    for name in _options(wanted):
+    for name in option_names(wanted):
         if not np.array_equal(getattr(wanted.opt, name), getattr(got.opt, name)):
             raise MadocError(f"the model {where} differs from the bound one in the option {name}")
 
@@ -190,17 +192,12 @@ def _copied(spec: mujoco.MjSpec, file: str, own_folder: str, folder: Path, copie
 
 def _write_options(spec: mujoco.MjSpec, nominal: mujoco.MjModel, bound: mujoco.MjModel) -> list[Change]:
     changes = []
-    for name in _options(bound):
+    for name in option_names(bound):
         old, new = getattr(nominal.opt, name), getattr(bound.opt, name)
         if not np.array_equal(old, new):
             setattr(spec.option, name, new)
             changes.append(Change("option", name, np.atleast_1d(old).tolist(), np.atleast_1d(new).tolist()))
     return changes
-
-
-def _options(model: mujoco.MjModel) -> list[str]:
-    """Names of the options of a model that are floating-point numbers."""
-    return [name for name in dir(model.opt) if isinstance(getattr(model.opt, name), float | np.ndarray)]
 
 
 def _write_inertia(spec: mujoco.MjSpec, nominal: mujoco.MjModel, bound: mujoco.MjModel) -> list[Change]:
@@ -222,7 +219,7 @@ def _write_inertia(spec: mujoco.MjSpec, nominal: mujoco.MjModel, bound: mujoco.M
 def _changed(nominal: mujoco.MjModel, bound: mujoco.MjModel) -> Iterator[tuple[str, str]]:
     """Kind of element and name of the arrays, with a row for each, in which two models differ, besides inertias."""
     for array in dir(bound):
-        kind = _KINDS.get(array.split("_")[0], "")
+        kind = KINDS_OF_ARRAYS.get(array.split("_")[0])
         if not kind or array in _INERTIAL or array.endswith("poly"):
             continue
         for one in (array, f"{array}poly"):
@@ -240,7 +237,7 @@ def _write_rows(
     attribute = _ATTRIBUTES.get(array, array.partition("_")[2])
     plural = {"body": "bodies", "equality": "equalities"}.get(kind, f"{kind}s")
     for element in getattr(spec, plural):
-        index = _index(bound, array, element.id)
+        index = int(rows_of(bound, array, element.id).start)
         old, new = _row(nominal, array, index), _row(bound, array, index)
         if old == new or not hasattr(element, attribute):
             continue
@@ -257,13 +254,6 @@ def _write_rows(
     return changes
 
 
-def _index(model: mujoco.MjModel, array: str, element: int) -> int:
-    """The row of an element in an array of the model; those of a joint by what the array has a row for."""
-    if array.startswith("dof_"):
-        return int(model.jnt_dofadr[element])
-    return int(model.jnt_qposadr[element]) if array.startswith("qpos") else element
-
-
 def _row(model: mujoco.MjModel, array: str, index: int) -> list[float]:
     """The numbers of an element; a damping or stiffness is followed by its quadratic and cubic ones, if any."""
     row = [float(value) for value in np.atleast_1d(getattr(model, array)[index])]
@@ -277,13 +267,6 @@ def _body_name(model: mujoco.MjModel, index: int) -> str:
     joint = model.body_jntadr[index]
     return body.name or (model.joint(joint).name if joint >= 0 else "") or str(index)
 
-
-_KINDS = {
-    **{kind: kind for kind in ("body", "geom", "site", "pair", "tendon", "actuator", "sensor")},
-    **dict.fromkeys(("dof", "jnt", "qpos0", "qpos"), "joint"),
-    "eq": "equality",
-}
-"""By the first word of an array's name, the kind of element in MJCF that has a row of it."""
 
 _ATTRIBUTES = {
     "qpos0": "ref",

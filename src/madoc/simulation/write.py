@@ -10,7 +10,7 @@ import numpy as np
 
 from madoc.errors import MadocError, nearest_hint
 from madoc.parameters import FIELDS, INERTIA, PAYLOAD, Parameter
-from madoc.simulation.arrays import check_field, check_written, numbers_at, write_number
+from madoc.simulation.arrays import check_field, check_written, numbers_at, rows_of, write_number
 from madoc.simulation.gears import backlash, deflections, gear_numbers, write_backlash
 from madoc.simulation.inertials import (
     write_centre_of_mass,
@@ -212,14 +212,9 @@ def linked_bodies(model: mujoco.MjModel) -> Iterator[tuple[str, float]]:
             yield model.body(body).name, distance
 
 
-def _dofs(model: mujoco.MjModel, joint: int) -> slice:
-    """The degrees of freedom of a joint: 6 of a free one, 3 of a ball, 1 of any other."""
-    return slice(model.jnt_dofadr[joint], model.jnt_dofadr[joint] + len(model.joint(joint).damping))
-
-
 def _write_friction_loss(model: mujoco.MjModel, joint: int, value: float) -> None:
     least = LEAST_FRICTION if has_speed_or_load_friction(model, joint) else 0.0
-    model.dof_frictionloss[_dofs(model, joint)] = max(value, least)
+    numbers_at(model, "dof_frictionloss", joint)[:] = max(value, least)
 
 
 def has_gain(model: mujoco.MjModel, actuator: int) -> bool:
@@ -319,10 +314,10 @@ _PLACES: dict[str, tuple[Numbers, Write | None]] = {
     "body_com": (lambda model, body: np.array([np.linalg.norm(model.body_ipos[body])]), write_centre_of_mass),
     "body_distance": (lambda model, body: np.array([np.linalg.norm(model.body_pos[body])]), _write_distance),
     **dict.fromkeys((*PAYLOAD, *INERTIA), (lambda model, body: np.zeros(1), None)),
-    "dof_frictionloss": (lambda model, joint: model.dof_frictionloss[_dofs(model, joint)], _write_friction_loss),
-    "dof_drag": (lambda model, joint: model.dof_dampingpoly[_dofs(model, joint), :1], None),
-    "dof_damping": (lambda model, joint: model.dof_damping[_dofs(model, joint)], None),
-    "dof_armature": (lambda model, joint: model.dof_armature[_dofs(model, joint)], None),
+    "dof_frictionloss": (lambda model, joint: numbers_at(model, "dof_frictionloss", joint), _write_friction_loss),
+    "dof_drag": (lambda model, joint: model.dof_dampingpoly[rows_of(model, "dof_", joint), :1], None),
+    "dof_damping": (lambda model, joint: model.dof_damping[rows_of(model, "dof_", joint)], None),
+    "dof_armature": (lambda model, joint: model.dof_armature[rows_of(model, "dof_", joint)], None),
     "jnt_stiffness": (lambda model, joint: model.jnt_stiffness[joint : joint + 1], None),
     "jnt_ref": (lambda model, joint: model.qpos0[model.jnt_qposadr[joint] :][:1], _write_ref),
     "geom_friction": (lambda model, geom: model.geom_friction[geom, :1], None),
