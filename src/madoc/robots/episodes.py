@@ -15,6 +15,7 @@ from madoc.robots.functions import NAMES, Argument, Function, read_functions
 from madoc.robots.model import Draft
 from madoc.robots.signals import Layout, Signals, Span
 from madoc.tasks.base import ActionChannel, Batch, never_terminated
+from madoc.types import generator
 
 _OF_STATE = ("position", "velocity")
 """What a reward or an end may read of the model by itself; sensors it may not."""
@@ -45,12 +46,14 @@ class Episode:
 class Starts:
     """How the beginnings of episodes are drawn: the goals in order, then values of the state by their address.
 
-    A function of a Python file may stand in the place of the latter; it draws with NumPy, and is not traced.
+    A function `reset` of a Python file may stand in the place of the latter; it draws with NumPy, and is not traced.
+    The layout says where the values of a state are.
     """
 
     goals: tuple[tuple[str, Expression], ...]
     reset: tuple[tuple[int, Expression], ...]
-    function: "ResetFunction | None" = None
+    layout: Layout
+    function: Function | None = None
 
     def offsets(
         self, key: PRNGKeyArray, count: int, *, start: Float[np.ndarray, " state"]
@@ -67,19 +70,12 @@ class Starts:
             value = _drawn(expression, drawn, jax.random.fold_in(of_reset, index), count)
             offsets = offsets.at[:, address].set(value - start[address])
         if self.function is not None:
-            return self.function.offsets(of_reset, offsets, drawn, start)
+            return self._by_function(self.function, of_reset, offsets, drawn, start)
         return offsets
 
-
-@dataclass(frozen=True)
-class ResetFunction:
-    """A function `reset` of a Python file, and where the values of a state are."""
-
-    function: Function
-    layout: Layout
-
-    def offsets(
+    def _by_function(
         self,
+        function: Function,
         key: PRNGKeyArray,
         offsets: Float[Array, "count state"],
         goals: Mapping[str, Array],
@@ -88,17 +84,17 @@ class ResetFunction:
         """Offsets from `start`, float64, with those of the values that the function names."""
         count, made = len(offsets), np.array(offsets, dtype=np.float64)
         values: dict[str, Argument] = {name: _read_only(np.asarray(goal, np.float64)) for name, goal in goals.items()}
-        values |= {"random": np.random.default_rng(np.asarray(jax.random.key_data(key))), "count": count}
-        result = self.function(values)
+        values |= {"random": generator(key), "count": count}
+        result = function(values)
         if not isinstance(result, Mapping):
             got = type(result).__name__
-            raise MadocError(f'{self.function.place}: expected {{"position(JOINT)": values, ...}}, got {got}')
+            raise MadocError(f'{function.place}: expected {{"position(JOINT)": values, ...}}, got {got}')
         for place, drawn in result.items():
             try:
                 address = _address(str(place), self.layout)
             except MadocError as error:
-                raise MadocError(f"{self.function.place}: {error}") from error
-            made[:, address] = self.function.checked(drawn, (count,), f" for {place}") - start[address]
+                raise MadocError(f"{function.place}: {error}") from error
+            made[:, address] = function.checked(drawn, (count,), f" for {place}") - start[address]
         return made
 
 
@@ -120,26 +116,21 @@ def read_episode(draft: Draft, signals: Signals, actions: tuple[ActionChannel, .
     names = tuple(name for name, _ in goals)
     reader = _Reader(draft, signals, actions, names)
     functions = _read_functions(reader)
-    reset = ResetFunction(functions["reset"], signals.layout) if "reset" in functions else None
-    reward: Callable[[Batch, Batch, Batch], Batch] = no_reward
-    ended: Callable[[Batch], Batch] = never_terminated
     if not actions and (spec.reward is not None or "reward" in functions):
         raise draft.document.error(("actions",), "a reward: is for a policy, which needs an action to choose; add one")
-    if "reward" in functions:
-        reward = partial(_function_reward, reader, functions["reward"])
-    elif spec.reward is not None:
-        reward = partial(_reward, reader, reader.expression("reward", spec.reward))
-    if "end" in functions:
-        ended = partial(_function_ended, reader, functions["end"])
-    elif spec.end is not None:
-        ended = partial(_ended, reader, reader.expression("end", spec.end))
+
+    def source(key: str) -> Expression | Function | None:
+        text = getattr(spec, key)
+        return functions.get(key) or (None if text is None else reader.expression(key, text))
+
+    reward, end = source("reward"), source("end")
     return Episode(
         goals=names,
-        reward=reward,
-        ended=ended,
-        starts=Starts(goals, _read_reset(draft, signals, names), reset),
-        differs=bool(spec.goals or spec.reset or spec.end is not None or functions.keys() & {"end", "reset"}),
-        rewarded=spec.reward is not None or "reward" in functions,
+        reward=no_reward if reward is None else partial(reader.reward, reward),
+        ended=never_terminated if end is None else partial(reader.ended, end),
+        starts=Starts(goals, _read_reset(draft, signals, names), signals.layout, functions.get("reset")),
+        differs=bool(spec.goals or spec.reset or end is not None or "reset" in functions),
+        rewarded=reward is not None,
     )
 
 
@@ -243,12 +234,22 @@ class _Reader:
     def _of_signals(self) -> dict[str, int]:
         return {signal.name: index for index, signal in enumerate(self.draft.spec.signals)}
 
-    def value(self, expression: Expression, state: Batch, action: Batch) -> Batch:
-        """The value of an expression after a step to `state` under `action`; without a warning where it has none."""
-        with np.errstate(all="ignore"):
-            return expression.value(partial(self._look_up, state, action), state.__array_namespace__())
+    def reward(self, of: Expression | Function, state: Batch, action: Batch, next_state: Batch) -> Batch:
+        """The reward of a step, by an expression or a function."""
+        return self._value(of, next_state, action)
 
-    def arguments(self, function: Function, state: Batch, action: Batch) -> dict[str, Argument]:
+    def ended(self, of: Expression | Function, next_state: Batch) -> Batch:
+        """Whether an episode has ended, by a condition or a function; neither reads an action."""
+        return self._value(of, next_state, None)
+
+    def _value(self, of: Expression | Function, state: Batch, action: Batch) -> Batch:
+        """The value after a step to `state` under `action`; without a warning where it has none."""
+        if isinstance(of, Function):
+            return of.rows(self._arguments(of, state, action), state.shape[:-1])
+        with np.errstate(all="ignore"):
+            return of.value(partial(self._look_up, state, action), state.__array_namespace__())
+
+    def _arguments(self, function: Function, state: Batch, action: Batch) -> dict[str, Argument]:
         """What a function of a Python file is handed after a step to `state` under `action`: float64, read-only."""
         state = np.asarray(state, dtype=np.float64)
         values: dict[str, Argument] = {}
@@ -276,23 +277,6 @@ class _Reader:
         channel = self.actions[of_actions[read.name]]
         middle, half = (channel.low + channel.high) / 2.0, (channel.high - channel.low) / 2.0
         return middle + half * action[..., of_actions[read.name]]
-
-
-def _reward(reader: _Reader, expression: Expression, state: Batch, action: Batch, next_state: Batch) -> Batch:
-    return reader.value(expression, next_state, action)
-
-
-def _ended(reader: _Reader, expression: Expression, next_state: Batch) -> Batch:
-    return reader.value(expression, next_state, None)  # which no end reads
-
-
-def _function_reward(reader: _Reader, function: Function, state: Batch, action: Batch, next_state: Batch) -> Batch:
-    return function.numbers(reader.arguments(function, next_state, action), next_state.shape[:-1])
-
-
-def _function_ended(reader: _Reader, function: Function, next_state: Batch) -> Batch:
-    values = reader.arguments(function, next_state, None)  # which no end reads
-    return function.conditions(values, next_state.shape[:-1])
 
 
 def no_reward(state: Batch, action: Batch, next_state: Batch) -> Batch:

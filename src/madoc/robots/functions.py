@@ -13,7 +13,7 @@ from pathlib import Path
 from types import ModuleType
 
 import numpy as np
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Float, Shaped
 
 from madoc.errors import MadocError, NotAllowed, nearest_hint
 from madoc.runs.files import read_bytes
@@ -117,17 +117,16 @@ class Function:
         except Exception as error:
             raise MadocError(_failed(self.file, self.name, error)) from error
 
-    def numbers(self, values: Mapping[str, Argument], shape: tuple[int, ...]) -> Rows:
-        """A number for every row, float64."""
-        return self.checked(self(values), shape)
-
-    def conditions(self, values: Mapping[str, Argument], shape: tuple[int, ...]) -> Bool[np.ndarray, "*rows"]:
-        """True or false for every row."""
-        result = np.asarray(self(values))
-        if result.dtype != np.bool_:
-            raise MadocError(f"{self.place}: expected an array of true and false, got {result.dtype}; compare numbers")
-        self._check_shape(result, shape)
-        return np.array(result)
+    def rows(self, values: Mapping[str, Argument], shape: tuple[int, ...]) -> Shaped[np.ndarray, "*rows"]:
+        """A number for every row, float64; of `end`, true or false."""
+        result = self(values)
+        if self.name != "end":
+            return self.checked(result, shape)
+        flags = np.asarray(result)
+        if flags.dtype != np.bool_:
+            raise MadocError(f"{self.place}: expected an array of true and false, got {flags.dtype}; compare numbers")
+        self._check_shape(flags, shape)
+        return np.array(flags)
 
     def checked(self, result: object, shape: tuple[int, ...], what: str = "") -> Rows:
         """A copy of numbers for every row as float64; anything else is refused, named by `what`."""
