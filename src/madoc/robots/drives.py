@@ -8,8 +8,8 @@ import mujoco
 from madoc.parameters import FIELDS, Parameter, ParameterSpace
 from madoc.robots.document import Place
 from madoc.robots.drive_spec import ConditionSpec, DriveSpec, FrictionSpec
-from madoc.robots.model import AddedActuator, Draft, JointFriction
-from madoc.simulation.callbacks import DRIVE, FRICTION, MARK, MEANS, UNLIMITED
+from madoc.robots.model import AddedActuator, Draft, friction_numbers
+from madoc.simulation.callbacks import DRIVE, MARK, MEANS, UNLIMITED
 from madoc.simulation.gears import SUFFIX, longest_timestep
 from madoc.simulation.user_data import by_own_elements, elements_of_drive
 from madoc.simulation.write import OF_A_JOINT, ONE_DOF
@@ -26,23 +26,9 @@ times theirs."""
 
 def drive_numbers(drive: DriveSpec, means: str, encoder: float) -> tuple[float, ...]:
     """The numbers of a drive in the model, in the order of `DRIVE`; what it takes from the log comes in later."""
-    return (
-        MARK,
-        float(MEANS.index(means)),
-        drive.supply,
-        drive.kt,
-        drive.resistance,
-        1.0 if drive.gain is None else drive.gain,
-        drive.damping_gain,
-        drive.duty_limit,
-        UNLIMITED if drive.current_limit is None else drive.current_limit,
-        drive.strength,
-        drive.saturation,
-        -1.0,
-        -1.0,
-        -1.0,
-        encoder,
-    )
+    given = {"gain": 1.0, "current_limit": UNLIMITED} | drive.model_dump(exclude_none=True)
+    own = DRIVE[DRIVE.index("supply") : DRIVE.index("enable")]
+    return (MARK, float(MEANS.index(means)), *(given[name] for name in own), -1.0, -1.0, -1.0, encoder)
 
 
 def with_inputs(
@@ -84,7 +70,7 @@ def with_inputs(
                 raise draft.document.error(place, f"the column {column!r} is used for something else already")
             inputs.setdefault(column, _input(channel, str(action.joint)))
             taken[action.name][DRIVE.index(key)] = float(first + list(inputs).index(column))
-    loaded = {joint for friction in draft.spec.friction if _friction_numbers(friction) for joint in friction.names}
+    loaded = {joint for friction in draft.spec.friction if friction_numbers(friction) for joint in friction.names}
     kept = any(len(other.userdata) for other in draft.base.actuators)
     if kept and (inputs or any(actuator.numbers for actuator in added)):
         raise draft.document.error(
@@ -131,9 +117,9 @@ def _as_elements(actuator: AddedActuator, *, loaded: bool) -> AddedActuator:
     return replace(actuator, gain=gain, stiffness=-position, damping=-speed, limit=largest, drag=drag)
 
 
-def joint_frictions(draft: Draft) -> tuple[JointFriction, ...]:
-    """What the spec says of the friction of joints, each joint once."""
-    found: dict[str, JointFriction] = {}
+def joint_frictions(draft: Draft) -> tuple[tuple[str, FrictionSpec], ...]:
+    """The joints of whose friction the spec says something, and what; each joint once."""
+    found: dict[str, FrictionSpec] = {}
     for index, friction in enumerate(draft.spec.friction):
         for joint in friction.names:
             single_joint(draft, ("friction", index), joint)
@@ -145,9 +131,8 @@ def joint_frictions(draft: Draft) -> tuple[JointFriction, ...]:
                 raise draft.document.error(
                     ("friction", index), f"the friction of {joint!r} is said already; say it once"
                 )
-            numbers = _friction_numbers(friction)
-            found[joint] = JointFriction(joint, friction.coulomb, friction.viscous, numbers)
-    return tuple(found.values())
+            found[joint] = friction
+    return tuple(found.items())
 
 
 def friction_parameters(draft: Draft, given: Sequence[Parameter]) -> list[Parameter]:
@@ -177,19 +162,6 @@ def _range(draft: Draft, index: int, term: str) -> tuple[float, float]:
             ("friction", index), f"expected up_to:, the largest friction in N·m, as {term} is to be calibrated"
         )
     return 0.0, up_to
-
-
-def _friction_numbers(friction: FrictionSpec) -> tuple[float, ...]:
-    """The numbers of a joint's friction in the model, in the order of `FRICTION`; empty where MuJoCo's own say it."""
-    if set(friction.chosen) <= {"coulomb", "viscous"}:
-        return ()
-
-    def number(name: str) -> float:
-        both = name.removesuffix("_motor").removesuffix("_external")
-        given = (getattr(friction, name, None), getattr(friction, both, None))
-        return next((value for value in given if value is not None), 1.0 if name in _SHAPE else 0.0)
-
-    return (MARK, *(number(name) for name in FRICTION[1:]))
 
 
 def single_joint(draft: Draft, place: Place, name: str) -> mujoco.MjsJoint:

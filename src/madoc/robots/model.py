@@ -8,11 +8,11 @@ import numpy as np
 
 from madoc.errors import MadocError
 from madoc.robots.document import Document
-from madoc.robots.drive_spec import GearSpec
+from madoc.robots.drive_spec import FrictionSpec, GearSpec
 from madoc.robots.functions import PythonFile
 from madoc.robots.model_files import ModelFiles
 from madoc.robots.spec import RobotSpec
-from madoc.simulation.callbacks import DRIVE
+from madoc.simulation.callbacks import DRIVE, FRICTION, MARK
 from madoc.simulation.gears import SUFFIX
 from madoc.simulation.user_data import LEAST_FRICTION
 from madoc.simulation.write import OF_A_JOINT, ONE_DOF
@@ -86,38 +86,39 @@ class AddedActuator:
     numbers: tuple[float, ...] = ()
 
 
-@dataclass(frozen=True)
-class JointFriction:
-    """The friction that a spec says of a joint: Coulomb (N·m), viscous (N·m·s/rad), None where it is the model's.
+def friction_numbers(friction: FrictionSpec) -> tuple[float, ...]:
+    """The numbers of a joint's friction in the model, in the order of `FRICTION`; empty where MuJoCo's own say it."""
+    if set(friction.chosen) <= {"coulomb", "viscous"}:
+        return ()
 
-    `numbers` are those of its terms that depend on speed and load (`callbacks.FRICTION`), empty where it has none.
-    """
+    def number(name: str) -> float:
+        both = name.removesuffix("_motor").removesuffix("_external")
+        given = (getattr(friction, name, None), getattr(friction, both, None))
+        otherwise = 1.0 if name in ("stribeck_speed", "stribeck_exponent") else 0.0
+        return next((value for value in given if value is not None), otherwise)
 
-    joint: str
-    coulomb: float | None
-    viscous: float | None
-    numbers: tuple[float, ...] = ()
+    return (MARK, *(number(name) for name in FRICTION[1:]))
 
 
 def make_model(
     base: mujoco.MjSpec,
     added: tuple[AddedActuator, ...] = (),
     timestep: float | None = None,
-    frictions: tuple[JointFriction, ...] = (),
+    frictions: tuple[tuple[str, FrictionSpec], ...] = (),
     gears: tuple[GearSpec, ...] = (),
 ) -> mujoco.MjSpec:
     """A copy of a spec with added actuators, frictions and gears, and with another timestep if one is given."""
     spec = base.copy()
     for gear in gears:
         _insert_gear(spec, gear)
-    for friction in frictions:
-        joint = spec.joint(friction.joint)
+    for name, friction in frictions:
+        joint, numbers = spec.joint(name), friction_numbers(friction)
         if friction.viscous is not None:
             joint.damping[0] = friction.viscous
         if friction.coulomb is not None:
             joint.frictionloss = friction.coulomb
-        if friction.numbers:
-            joint.userdata = friction.numbers
+        if numbers:
+            joint.userdata = numbers
             joint.frictionloss = max(joint.frictionloss, LEAST_FRICTION)
     if timestep is not None:
         spec.option.timestep = timestep
