@@ -111,14 +111,8 @@ class Dataset:
     def split(self, share: float = 0.2, *, key: PRNGKeyArray | None = None) -> tuple["Dataset", "Dataset"]:
         """Hold out about `share` of the rows to judge an estimate by: `train, held_out = dataset.split(0.2)`.
 
-        Whole episodes are held out, or stretches where there are few; `hold_out` says how.
-
-        Args:
-            share: Share of the rows that are held out, between 0 and 1.
-            key: Draws the episodes; without one, the draw is always the same.
-
-        Raises:
-            MadocError: The share is not between 0 and 1, or there are fewer than 2 rows.
+        Whole episodes are held out, or stretches where there are few; `hold_out` says how, and what it refuses. The
+        key draws the episodes; without one, the draw is always the same.
         """
         parts = hold_out(self, share, jax.random.key(0) if key is None else key)
         return parts.kept, parts.held

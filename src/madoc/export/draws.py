@@ -100,14 +100,10 @@ def save_draws(
     values: Float[np.ndarray, "draws parameters"],
     numbers: Mapping[str, tuple[Int[np.ndarray, " numbers"], Num[np.ndarray, "draws numbers"]]],
 ) -> tuple[Path, Path]:
-    """Write `draws.npz` and `draws.py` into a folder: the values of every draw, and the numbers of the model.
+    """Write `draws.npz` and `draws.py` into a folder: the values of every draw, in the units of the parameters.
 
-    Args:
-        folder: Where.
-        names: Of the parameters.
-        around: Names of those that are not in a model.
-        values: Of the parameters in every draw, in their units.
-        numbers: By array of the model, the places that change and their numbers in every draw.
+    Of the parameters, those `around` are not in a model; `numbers` are, by array of the model, the places that change
+    and their numbers in every draw.
     """
     table, source = folder / "draws.npz", folder / "draws.py"
     stored = {"names": np.array(names), "around": np.array(around, dtype=str), "values": values}

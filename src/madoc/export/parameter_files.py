@@ -197,12 +197,7 @@ def save_bam(path: Path, drive: JointDrive, delay: float, lag: float = 0.0) -> N
     """Write the parameters of one drive, its joint's friction and armature, and what BAM cannot say of them.
 
     Friction is BAM's `m1` where MuJoCo's own elements say it, else `m6`: Isaac Lab reads neither `m3` nor `m4`.
-
-    Args:
-        path: The file.
-        drive: The drive at the estimate.
-        delay: From a command to its effect, s.
-        lag: Time constant with which the command is followed, s.
+    The delay is that from a command to its effect, the lag the time constant with which the command is followed, s.
     """
     of, strength = drive.numbers, drive.numbers["strength"]
     content = {

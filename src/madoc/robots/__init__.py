@@ -23,10 +23,8 @@ SUFFIXES = (".yaml", ".yml")
 def load(path: str | Path, *, allow_code: bool = False, allow_outside: bool = False) -> Robot:
     """Read a spec file and its model. Files whose content has not changed are parsed and compiled once.
 
-    Args:
-        path: The file.
-        allow_code: Run the Python file that the spec names, if it names one; else such a spec is refused.
-        allow_outside: Read files outside the model's folder that the model names; else such a model is refused.
+    A spec that names a Python file, which is run, needs `allow_code`; a model that names files outside its folder needs
+    `allow_outside`.
 
     Raises:
         MadocError: A file is missing, or the spec has a mistake; the sentence names its line.
@@ -74,13 +72,9 @@ def restore(source: Mapping[str, object], *, allow_code: bool = False) -> Robot:
 def resolve(
     name: str | Path, physics: str | None = None, *, allow_code: bool = False, allow_outside: bool = False
 ) -> Task:
-    """The task of a robot, given by name or by the path of a spec file.
+    """The task of a robot, given by name, as `hopper`, or by the path of a spec file, as `arm.yaml`; see `load`.
 
-    Args:
-        name: The name of one of Madoc's robots, as `hopper`, or a path, as `arm.yaml`.
-        physics: `legacy` or `modern`; None takes `legacy` for Madoc's robots. A robot of a spec file is `modern`.
-        allow_code: As for `load`.
-        allow_outside: As for `load`.
+    Physics is `legacy` or `modern`; None takes `legacy` for Madoc's robots. A robot of a spec file is `modern`.
 
     Raises:
         MadocError: There is no such robot, or `load` refuses its file.

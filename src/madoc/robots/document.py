@@ -79,11 +79,7 @@ def read_document(
 ) -> Document:
     """Read YAML 1.2 that has no tags, no anchors and no key twice; anything else is refused with its line.
 
-    Args:
-        content: The file's.
-        file: Its name.
-        what: What the file should be, for the sentence of a refusal.
-        remedy: What to do where it is empty, for the same.
+    Sentences say `what` the file should be, and that the `remedy` is for an empty one.
     """
     if len(content) > LARGEST_FILE:
         raise MadocError(f"{file} has {len(content):,} bytes, {what} at most {LARGEST_FILE:,}; is it the right file?")
@@ -244,12 +240,9 @@ def refused_with_line(document: Document, whole: type[BaseModel]) -> Iterator[No
 
 
 def mistake(detail: ErrorDetails, place: Place, known: list[str]) -> str:
-    """A finding of pydantic in words: what was expected, where, and what was there instead.
+    """A finding of pydantic at a place of a file in words: what was expected, and what was there instead.
 
-    Args:
-        detail: The finding.
-        place: Where it is, by the keys of the file.
-        known: The keys that the part around it may have.
+    `known` are the keys that the part around it may have.
     """
     kind, got = detail["type"], detail["input"]
     what = ".".join(str(part) for part in place if not isinstance(part, int))

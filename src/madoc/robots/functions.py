@@ -145,11 +145,7 @@ class Function:
 
 
 def read_functions(file: PythonFile, known: Mapping[str, Sequence[str]]) -> dict[str, Function]:
-    """The functions of a file, which is imported.
-
-    Args:
-        file: The file.
-        known: The names of the arguments that each of `NAMES` may have.
+    """The functions of a file, which is imported; `known` are the arguments that each of `NAMES` may have.
 
     Raises:
         MadocError: The file cannot be imported, defines none of them, or one has an argument that is not known.

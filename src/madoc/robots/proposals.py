@@ -117,14 +117,10 @@ class Proposal:
 def proposals(
     model: mujoco.MjModel, recipe: Recipe | None, kind: str, *, guessed: frozenset[str], step: float
 ) -> list[Proposal]:
-    """The lines, those that matter most first.
+    """The lines, those that matter most first, of a model that has the actuators that the spec adds.
 
-    Args:
-        model: With the actuators that the spec adds.
-        recipe: Ranges of drives, if the user named a class of machines.
-        kind: Name of the recipe.
-        guessed: Actuators whose stiffness is a guess.
-        step: Of control, s.
+    The recipe, whose name is `kind`, is that of a class of machines if the user named one; the stiffness of the
+    `guessed` actuators is a guess; `step` is that of control, s.
     """
     joints = [joint for joint in element_names(model, "joint") if is_single(model, model.joint(joint).id)]
     servos = [actuator for actuator in element_names(model, "actuator") if is_servo(model, actuator)]

@@ -97,7 +97,7 @@ class Simulator(Protocol):
     ) -> Int[np.ndarray, " rows"]:
         """Number of pairs of geoms in contact in each state, at physical values, which are mid-range unless given.
 
-        No parameter changes the shape of a body; only `jnt_ref` changes where positions place it.
+        No parameter changes the shape of a body; `jnt_ref`, `body_distance` and numbers of the model may move it.
         """
 
     def model(self, values: Float[np.ndarray, " parameters"]) -> mujoco.MjModel:

@@ -32,11 +32,7 @@ _VALUES_AT_ONCE = 4_000_000
 
 
 class CpuSimulator:
-    """A task's MuJoCo model with calibratable parameters.
-
-    Args:
-        task: The robot.
-        threads: Number of cores that step it; by default all that this process may use.
+    """A task's MuJoCo model with calibratable parameters; as many cores as `threads`, by default all, step it.
 
     Raises:
         MadocError: A parameter names an element that the model does not have.
@@ -153,10 +149,7 @@ class CpuSimulator:
     def contacts(
         self, state: Float[np.ndarray, "rows state"], values: Float[np.ndarray, " parameters"] | None = None
     ) -> Int[np.ndarray, " rows"]:
-        """Number of pairs of geoms in contact in each state, at physical values, which are mid-range unless given.
-
-        No parameter changes the shape of a body; `jnt_ref`, `body_distance` and numbers of the model may move it.
-        """
+        """Number of pairs of geoms in contact in each state, at physical values, which are mid-range unless given."""
         moving = ("jnt_ref", "body_distance")
         placed = any(row.field in moving or row.field not in FIELDS for row in self.parameters.parameters)
         model = self.model(self.parameters.middle if values is None else values) if placed else self._model
@@ -217,11 +210,7 @@ class CpuSystem:
         action: Float[np.ndarray, "..."],
         force: Float[np.ndarray, "systems rows dof"] | None = None,
     ) -> Float[np.ndarray, "..."]:
-        """One control step of `frame_skip` physics steps; a row whose simulation diverges comes back as NaN.
-
-        `force` acts on each degree of freedom from outside all the while. States and actions that are not of shape
-        (systems, rows, values) are refused.
-        """
+        """One control step of `frame_skip` physics steps; other shapes than (systems, rows, values) are refused."""
         return self.roll_out(state, action[:, :, None], None if force is None else force[:, :, None])[:, :, 0]
 
     def roll_out(
@@ -230,10 +219,7 @@ class CpuSystem:
         actions: Float[np.ndarray, "..."],
         force: Float[np.ndarray, "systems rows steps dof"] | None = None,
     ) -> Float[np.ndarray, "systems rows steps state"]:
-        """The state after each of the actions of shape (systems, rows, steps, action); NaN from where it diverges.
-
-        `force` is what acts on each degree of freedom from outside during each of the steps.
-        """
+        """The state after each of the actions of shape (systems, rows, steps, action); NaN from where it diverges."""
         self._check_shapes(state.shape, (*actions.shape[:2], *actions.shape[3:]))
         (count, rows, steps, _), pending = actions.shape, self._simulator.task.pending
         SIMULATED.control_steps += count * rows * steps
@@ -280,10 +266,7 @@ class CpuSystem:
     def actuator_forces(
         self, state: Float[np.ndarray, "systems rows state"], action: Float[np.ndarray, "systems rows action"]
     ) -> Float[np.ndarray, "systems rows actuator dof"]:
-        """What each actuator exerts on every degree of freedom at the start of a step, in N or N·m.
-
-        Late actions count as late.
-        """
+        """What each actuator exerts on every degree of freedom at the start of a step, in N or N·m."""
         history = self._histories(state, action[:, :, None])[:, :, 0]
         control = self._simulator._controls(blend(self._weights, history))[:, :, 0]
         models = self._models_of(control)

@@ -54,15 +54,7 @@ def save_mjcf(simulator: Simulator, values: Float[np.ndarray, " parameters"], pa
 
     A model with drives or friction that MuJoCo's own elements do not say comes with `DRIVES`, whose `load` reads it.
     Where an inertia changes, all inertias are made explicit, so that compiling the file does not infer them again from
-    geoms, total masses or bounds.
-
-    Args:
-        simulator: The robot.
-        values: Physical values, one for each parameter.
-        path: The file; its folder exists.
-
-    Returns:
-        The attributes in which the model differs from the robot's own.
+    geoms, total masses or bounds. Returned are the attributes in which the model differs from the robot's own.
 
     Raises:
         MadocError: The file cannot be written, an asset is missing, or the written model is not the bound one.

@@ -115,11 +115,8 @@ def side_camera(
 ) -> tuple[Camera, float]:
     """The camera from whose side all frames move most and fit, and the width of its picture by the height.
 
-    Args:
-        ends: The outlines of the frames, m.
-        radius: Radius of each geom, m.
-        fovy: Vertical angle of view, deg.
-        most: Largest ratio of width to height; the smallest is one by this.
+    `ends` and `radius` are the outlines of the frames, m, `fovy` is the vertical angle of view, deg, and `most` the
+    largest ratio of width to height; the smallest is one by this.
     """
     low = (ends - radius[:, None, None]).min((1, 2))
     high = (ends + radius[:, None, None]).max((1, 2))

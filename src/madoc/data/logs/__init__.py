@@ -49,12 +49,8 @@ def read(
     """Read logs of a robot from files and folders; each file, or each episode in one, is a run.
 
     Observations are the spec's signals in its order and units, actions are scaled to [-1, 1] by their ranges, rewards
-    are 0 and nothing terminates. The dataset's `findings` say what was cut or resampled.
-
-    Args:
-        paths: A file or folder, or several.
-        robot: A robot of `robots.load`.
-        clip_actions: Clip actions outside their channels' ranges instead of refusing them.
+    are 0 and nothing terminates. The dataset's `findings` say what was cut or resampled. Actions outside their
+    channels' ranges are refused, or clipped with `clip_actions`.
 
     Raises:
         MadocError: One sentence: the file, the row and column, what was expected, what is there, what to do.
