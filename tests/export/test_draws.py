@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from madoc import robots, simulation
-from madoc.export import save_draws
+from madoc.export.draws import save_draws
 from madoc.policies.systems import NormalParameters
 from madoc.simulation.mjcf import numbers_of_draws
 from own_robots import SPRING_SPEC, write_robot

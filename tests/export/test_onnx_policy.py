@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from madoc.errors import MadocError
-from madoc.export import save_onnx
+from madoc.export.onnx_policy import save_onnx
 from madoc.numpy_policy import NumpyPolicy
 
 

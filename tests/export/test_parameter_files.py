@@ -10,7 +10,14 @@ from ruamel.yaml import YAML
 
 from madoc import robots
 from madoc.calibration import ParameterEstimate
-from madoc.export import Exported, bam_files, save_bam, save_patch, save_randomization, save_sysid_parameters
+from madoc.export.parameter_files import (
+    Exported,
+    bam_files,
+    save_bam,
+    save_patch,
+    save_randomization,
+    save_sysid_parameters,
+)
 from madoc.parameters import Parameter
 from madoc.simulation import make
 from madoc.simulation.configuration import JointDrive, joint_drives

@@ -9,7 +9,7 @@ import pytest
 
 from madoc import simulation
 from madoc.errors import MadocError
-from madoc.export import save_recordings, serve_recordings
+from madoc.export.recording import save_recordings, serve_recordings
 from robots import spring
 
 SIMULATOR = simulation.make(spring(), threads=1)

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from madoc.calibration.result import ParameterEstimate
-from madoc.export import Exported, Robot, save_isaac_lab, save_mjlab
+from madoc.export.parameter_files import Exported
+from madoc.export.trainers import Robot, save_isaac_lab, save_mjlab
 from madoc.parameters import Parameter
 from madoc.simulation.configuration import JointActuator
 

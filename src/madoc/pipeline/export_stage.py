@@ -9,22 +9,19 @@ from jaxtyping import Float
 
 from madoc import simulation
 from madoc.errors import MadocError
-from madoc.export import (
+from madoc.export.draws import save_draws
+from madoc.export.onnx_policy import save_onnx
+from madoc.export.parameter_files import (
     Exported,
-    Robot,
     bam_files,
     is_patch,
     save_bam,
-    save_draws,
-    save_isaac_lab,
-    save_mjlab,
-    save_onnx,
     save_patch,
     save_randomization,
-    save_recordings,
     save_sysid_parameters,
-    serve_recordings,
 )
+from madoc.export.recording import save_recordings, serve_recordings
+from madoc.export.trainers import Robot, save_isaac_lab, save_mjlab
 from madoc.numpy_policy import NumpyPolicy
 from madoc.pipeline.calibrated import Calibrated, read_calibration
 from madoc.pipeline.evaluation_stage import find_policies
