@@ -116,7 +116,7 @@ shapes apart, and 1 where it does so without a bounce. A payload adds to the bod
 inertia about each axis is its mass times the square of its radius of gyration. `drive_*` are the numbers of a d.c.
 drive, `friction_*` those of friction that depends on speed and load (`simulation/callbacks.py` has the equations);
 `friction_load` and `friction_stribeck_load` are one value for the motor's and the external torque. `gear_*` are the
-numbers of the gear behind a joint (`simulation/gears.py`); its backlash is the whole width of the play.
+numbers of the gear behind a joint (`simulation/joints.py`); its backlash is the whole width of the play.
 """
 
 

@@ -49,7 +49,7 @@ IN_MODEL = [
     for name, field in FIELDS.items()
     if field.in_model and name not in (*PAYLOAD, *INERTIA) and name.split("_")[0] not in ("drive", "friction", "gear")
 ]
-"""Fields of a plain model whose numbers are apart; test_user_data.py and test_gears.py have what a spec adds."""
+"""Fields of a plain model whose numbers are apart; test_joints.py has what a spec adds."""
 
 
 @pytest.fixture

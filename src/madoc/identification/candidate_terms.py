@@ -16,10 +16,9 @@ from madoc.identification.windows import evenly
 from madoc.parameters import FIELDS, INERTIA, PAYLOAD, Parameter
 from madoc.robots.space import element_unit
 from madoc.simulation.base import Simulator
-from madoc.simulation.gears import deflections
 from madoc.simulation.inertials import off_centre
+from madoc.simulation.joints import deflections, is_drive
 from madoc.simulation.probes import touching_geoms
-from madoc.simulation.user_data import is_drive
 from madoc.simulation.write import body_reach, element_names, has_gain, heavy_bodies, linked_bodies, nominal_values
 
 DELAY = "actions that take effect later, by a delay or a lag of the actuator"

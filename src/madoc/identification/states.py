@@ -12,7 +12,7 @@ from madoc.data.velocities import moving_states
 from madoc.errors import MadocError
 from madoc.identification.windows import Windows, consecutive_rows, evenly, longest_fit, rows_that_fit, windows_at
 from madoc.simulation.base import Simulator
-from madoc.simulation.gears import deflection_values, deflections, loaded_deflections
+from madoc.simulation.joints import deflection_values, deflections, loaded_deflections
 from madoc.simulation.rollout import reset_states
 from madoc.simulation.unobserved import Placed, on_the_floor, unseen_values
 from madoc.tasks import Task

@@ -39,8 +39,8 @@ from madoc.simulation.configuration import (
     physics_options,
     start_position,
 )
+from madoc.simulation.joints import needs_callbacks
 from madoc.simulation.mjcf import DRIVES, numbers_of_draws, save_mjcf
-from madoc.simulation.user_data import needs_callbacks
 from madoc.simulation.write import element_names, nominal_values
 
 DRAWS = 1000

@@ -13,8 +13,7 @@ from madoc.robots.functions import PythonFile
 from madoc.robots.model_files import ModelFiles
 from madoc.robots.spec import RobotSpec
 from madoc.simulation.callbacks import DRIVE, FRICTION, MARK
-from madoc.simulation.gears import SUFFIX
-from madoc.simulation.user_data import LEAST_FRICTION
+from madoc.simulation.joints import LEAST_FRICTION, SUFFIX
 from madoc.simulation.write import OF_A_JOINT, ONE_DOF
 from madoc.tasks.base import compiled_model
 from madoc.tasks.physics import refuse_unfit_mujoco

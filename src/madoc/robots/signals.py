@@ -17,7 +17,7 @@ from madoc.errors import MadocError, nearest_hint
 from madoc.robots.expressions import Expression, Read, parse
 from madoc.robots.model import Draft, is_single, is_slide
 from madoc.robots.spec import SCALES
-from madoc.simulation.gears import SUFFIX, deflection_values
+from madoc.simulation.joints import SUFFIX, deflection_values
 from madoc.simulation.probes import linear_sensors
 from madoc.simulation.write import element_names
 from madoc.tasks.base import Batch

@@ -12,8 +12,15 @@ from jaxtyping import PRNGKeyArray
 
 from madoc import simulation
 from madoc.errors import MadocError
-from madoc.robots.actions import action_channel, added_actuator, idle_actuators
-from madoc.robots.drives import check_gears, check_timestep, joint_frictions, with_inputs
+from madoc.robots.drives import (
+    action_channel,
+    added_actuator,
+    check_gears,
+    check_timestep,
+    idle_actuators,
+    joint_frictions,
+    with_inputs,
+)
 from madoc.robots.episodes import Episode, no_reward, read_episode
 from madoc.robots.functions import PythonFile
 from madoc.robots.model import Draft, compiled, make_model, read_model, with_whole_inertia

@@ -7,8 +7,7 @@ import mujoco
 import numpy as np
 
 from madoc.simulation.callbacks import DRIVE, FRICTION, MEANS, UNLIMITED
-from madoc.simulation.gears import deflections
-from madoc.simulation.user_data import has_speed_or_load_friction, is_drive
+from madoc.simulation.joints import deflections, has_speed_or_load_friction, is_drive
 from madoc.simulation.write import OF_A_JOINT, ONE_DOF, has_gain
 
 

@@ -15,8 +15,8 @@ from madoc.parameters import FIELDS
 from madoc.runs.machine import usable_cores
 from madoc.simulation.base import SIMULATED
 from madoc.simulation.delay import LAGS, action_weights, blend
+from madoc.simulation.joints import install_callbacks, needs_callbacks
 from madoc.simulation.probes import collided, drive_forces, sensing_motion
-from madoc.simulation.user_data import install_callbacks, needs_callbacks
 from madoc.simulation.write import check_elements, conditions_of, write_parameters
 from madoc.tasks.base import Task
 

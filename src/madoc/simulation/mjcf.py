@@ -18,7 +18,7 @@ from madoc.runs.files import replacing
 from madoc.simulation import callbacks
 from madoc.simulation.arrays import option_names, rows_of
 from madoc.simulation.base import Simulator
-from madoc.simulation.user_data import needs_callbacks
+from madoc.simulation.joints import needs_callbacks
 from madoc.simulation.write import write_parameters
 from madoc.tasks.physics import write_inertia
 

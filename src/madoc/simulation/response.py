@@ -10,7 +10,7 @@ from madoc.errors import MadocError
 from madoc.parameters import Parameter
 from madoc.simulation.base import Simulator
 from madoc.simulation.cpu import without_warnings
-from madoc.simulation.user_data import scale_forces
+from madoc.simulation.joints import scale_forces
 from madoc.simulation.write import OF_A_JOINT, ONE_DOF, single_joints
 from madoc.types import generator
 

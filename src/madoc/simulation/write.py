@@ -11,7 +11,6 @@ import numpy as np
 from madoc.errors import MadocError, nearest_hint
 from madoc.parameters import FIELDS, INERTIA, PAYLOAD, Parameter
 from madoc.simulation.arrays import check_field, check_written, numbers_at, rows_of, write_number
-from madoc.simulation.gears import backlash, deflections, gear_numbers, write_backlash
 from madoc.simulation.inertials import (
     write_centre_of_mass,
     write_deviations,
@@ -19,12 +18,16 @@ from madoc.simulation.inertials import (
     write_mass,
     write_mass_and_inertia,
 )
-from madoc.simulation.user_data import (
+from madoc.simulation.joints import (
     LEAST_FRICTION,
+    backlash,
+    deflections,
     drive_number,
     friction_numbers,
+    gear_numbers,
     has_numbers,
     has_speed_or_load_friction,
+    write_backlash,
     write_elements,
 )
 from madoc.tasks.base import Task
