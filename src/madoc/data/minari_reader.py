@@ -101,7 +101,9 @@ def read_episodes(directory: Path) -> tuple[list["EpisodeData"], str]:
     for file in directory.rglob("*.hdf5"):
         with opened(file, "it is damaged or was cut short, download or record it again") as held:
             sizes: list[int] = []
-            held.visititems(lambda _, item, told=sizes: told.append(size_of(item)) if _is_values(item) else None)
+            held.visititems(
+                lambda _, item, told=sizes: told.append(size_of(item)) if isinstance(item, h5py.Dataset) else None
+            )
         check_size(sum(sizes), f"the Minari dataset in {directory}", LARGEST_DATASET)
     try:
         with warnings.catch_warnings():
@@ -115,11 +117,6 @@ def read_episodes(directory: Path) -> tuple[list["EpisodeData"], str]:
             f"cannot read the Minari dataset in {directory} ({type(error).__name__}: {error}); it is damaged "
             "or was cut short, download or record it again"
         ) from error
-
-
-def _is_values(item: object) -> bool:
-    """Whether an item of an HDF5 file has values."""
-    return isinstance(item, h5py.Dataset)
 
 
 def _import_minari() -> ModuleType:

@@ -7,7 +7,6 @@ larger current. Where a joint is driven faster than its supply could, BAM lets t
 not.
 """
 
-import json
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -18,7 +17,7 @@ from madoc.calibration.result import ParameterEstimate
 from madoc.identification.information import NORMAL_95
 from madoc.parameters import Parameter
 from madoc.robots.document import yaml_text
-from madoc.runs.files import read_bytes, replacing
+from madoc.runs.files import read_bytes, replacing, write_json
 from madoc.simulation.configuration import JointDrive
 from madoc.simulation.mjcf import Change
 
@@ -218,8 +217,7 @@ def save_bam(path: Path, drive: JointDrive, delay: float, lag: float = 0.0) -> N
         "max_current": None if drive.current_limit is None else strength * drive.current_limit,
         "not_the_same_here": _lost(drive, delay, lag),
     }
-    with replacing(path) as stream:
-        stream.write((json.dumps(content, indent=2, ensure_ascii=False) + "\n").encode())
+    write_json(path, content)
 
 
 def _lost(drive: JointDrive, delay: float, lag: float) -> Sequence[str]:

@@ -107,7 +107,7 @@ def spec_text(model: Path, out: Path, *, allow_outside: bool = False, recipe: st
         "# What is calibrated, each within its range: wide enough to hold the truth, and only what matters.",
         '# One value for several: {field: dof_damping, elements: "*_knee", name: knees, low: 0, high: 1}, or one for',
         '# each of several: {field: dof_damping, each: "*_knee", low: 0, high: 1}.',
-        *_about(recipe, chosen),
+        *([] if chosen is None else [f"# Ranges of {recipe}: of {chosen.about}."]),
         "parameters:",
         *_parameters(driven, proposals(driven, chosen, recipe, guessed=guessed, step=step)),
         f"  # - {_mapping(field='signal_bias', element=signals[0][0], low=-0.1, high=0.1)}  # what it reads too much",
@@ -242,11 +242,6 @@ def _remarks(model: mujoco.MjModel) -> Iterator[str]:
 def _geom_name(model: mujoco.MjModel, geom: int) -> str:
     """The name of a geom, or of its body where it has none."""
     return model.geom(geom).name or model.body(int(model.geom_bodyid[geom])).name or f"geom {geom}"
-
-
-def _about(recipe: str, chosen: Recipe | None) -> Iterator[str]:
-    if chosen is not None:
-        yield f"# Ranges of {recipe}: of {chosen.about}."
 
 
 def _parameters(model: mujoco.MjModel, lines: list[Proposal]) -> Iterator[str]:

@@ -78,9 +78,6 @@ def _use_legacy_inertia(spec: mujoco.MjSpec) -> None:
     for body in spec.bodies[1:]:
         geoms = model.body_geomadr[body.id] + np.arange(model.body_geomnum[body.id])
         parts = [_geom_inertia(model, geom, densities[geom]) for geom in geoms.tolist()]
-        if not parts:
-            body.mass = 0.0
-            continue
         mass = sum(part[0] for part in parts)
         centre = sum(part[0] * part[1] for part in parts) / mass
         inertia = np.sum([part[2] + part[0] * _parallel_axis(part[1] - centre) for part in parts], axis=0)
