@@ -39,14 +39,7 @@ def holds(path: Path, *names: str) -> bool:
 
 @dataclass(frozen=True)
 class Stored:
-    """An array of a file that has not been read.
-
-    Attributes:
-        shape: Its shape.
-        dtype: Kind of its values.
-        size: Its size in memory, bytes; for values of any length at least.
-        read: Reads it.
-    """
+    """An array of a file that has not been read; `size` is that in memory, bytes, of values of any length the least."""
 
     shape: tuple[int, ...]
     dtype: np.dtype

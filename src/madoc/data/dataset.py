@@ -217,13 +217,7 @@ _SHORTEST = 20
 
 @dataclass(frozen=True)
 class Split:
-    """A log in two parts.
-
-    Attributes:
-        kept: The rows that methods calibrate to.
-        held: The rows that their estimates are judged by.
-        sentence: How the rows were chosen.
-    """
+    """A log in two parts, rows that methods calibrate to and rows that judge them, and how these were chosen."""
 
     kept: Dataset
     held: Dataset

@@ -32,13 +32,9 @@ OF_RANGES = (
 
 @dataclass(frozen=True)
 class Exported:
-    """One parameter as it is exported.
+    """One parameter as it is exported: its estimate, and its `own` values in the robot's model, one for each element.
 
-    Attributes:
-        parameter: Its field, elements and range.
-        row: Its estimate.
-        own: The values in the robot's own model, one for each element.
-        left_out: A clause with what leaving it as it is there costs over held-out runs; empty where that is not known.
+    `left_out` is a clause with what leaving it as it is there costs over held-out runs; empty where that is not known.
     """
 
     parameter: Parameter

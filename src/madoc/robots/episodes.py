@@ -23,15 +23,10 @@ _OF_STATE = ("position", "velocity")
 
 @dataclass(frozen=True)
 class Episode:
-    """The functions of an episode, batched, on NumPy or JAX arrays.
+    """The functions of an episode, batched, on NumPy or JAX arrays: `reward` of a step, and whether it has `ended`.
 
-    Attributes:
-        goals: Names of the values that are drawn for each episode; they end the state.
-        reward: (state, action, next state) -> reward.
-        ended: next state -> whether the episode has ended there.
-        starts: How goals and starts are drawn.
-        differs: Whether an episode differs from a log of the robot in more than its reward.
-        rewarded: Whether there is a reward.
+    Goals are drawn for each episode and end the state. It `differs` from a log of the robot where that is in more than
+    its reward.
     """
 
     goals: tuple[str, ...]

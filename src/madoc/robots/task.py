@@ -57,16 +57,10 @@ class Signal:
 
 @dataclass(frozen=True)
 class Robot:
-    """A robot that a user describes in a spec file.
+    """A robot that a user describes in a spec file, as a task like any other.
 
-    Attributes:
-        path: The spec file.
-        spec: The content of that file.
-        task: The robot as a task, like any other.
-        signals: The values of an observation, in order.
-        undetermined: Sentences on the positions and velocities that an observation does not determine.
-        notes: Sentences on what a user should know of the robot.
-        model_files: Names of the files of its model, all of which a run folder keeps.
+    Sentences say which positions and velocities an observation leaves `undetermined`, and what else a user should know.
+    A run folder keeps all of the model's files.
     """
 
     path: Path

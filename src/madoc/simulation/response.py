@@ -49,15 +49,7 @@ _FORCES = (
 
 @dataclass(frozen=True)
 class DrivenJoint:
-    """A hinge or slide that an action drives by an actuator of its own.
-
-    Attributes:
-        action: Index of the action.
-        joint: Name of the joint.
-        hinge: Whether it is a hinge.
-        position: Index of its position in a state.
-        velocity: Index of its velocity in a state.
-    """
+    """A hinge or slide that an action drives by an actuator of its own, with the places of its values in a state."""
 
     action: int
     joint: str

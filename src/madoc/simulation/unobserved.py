@@ -100,13 +100,7 @@ _PLACINGS = 3
 
 @dataclass(frozen=True)
 class Placed:
-    """States of a log with free bases on the floor.
-
-    Attributes:
-        states: (qpos, qvel) of every row.
-        found: Which values of (qpos, qvel) are not observed, and were found.
-        heights: Those of them that are heights.
-    """
+    """States (qpos, qvel) of a log with free bases on the floor: which values were found, and which are heights."""
 
     states: Float[np.ndarray, "rows physical"]
     found: Bool[np.ndarray, " physical"]

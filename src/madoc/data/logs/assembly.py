@@ -38,14 +38,9 @@ _BROKEN = f"NaN, infinity, more than {LARGEST:.0e} or nothing in a signal or act
 
 @dataclass(frozen=True)
 class Steps:
-    """The rows of a run on the robot's control steps.
+    """The rows of a run on the robot's control steps, with actions in their units, and the names of rows in errors.
 
-    Attributes:
-        observation: Signals by row.
-        action: Actions by row, in their units.
-        linked: Whether the next row follows one control step later and both can be used.
-        place: The name of a row in an error.
-        findings: Notes and warnings.
+    They are `linked` where the next row follows one control step later and both can be used.
     """
 
     observation: Float[np.ndarray, "rows signals"]

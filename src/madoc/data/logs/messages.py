@@ -27,13 +27,9 @@ Decoder = Callable[[bytes], object]
 
 @dataclass(frozen=True)
 class Kind:
-    """What messages of a topic are.
+    """What messages of a topic are: in `json` or `cdr`, and of a ROS type as `sensor_msgs/msg/JointState`.
 
-    Attributes:
-        encoding: `json` or `cdr`; of another nothing is read.
-        name: Name of the ROS type, as `sensor_msgs/msg/JointState`.
-        definition: Its definition, with those of the types it is made of; empty where the log has none.
-        idl: Whether the definition is in IDL.
+    Its definition has those of the types it is made of, in IDL or not; it is empty where the log has none.
     """
 
     encoding: str

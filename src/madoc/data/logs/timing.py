@@ -35,15 +35,7 @@ _ROUNDING = 1e-6
 
 @dataclass(frozen=True)
 class Series:
-    """Columns of one table of a run.
-
-    Attributes:
-        time: Time of each row in s.
-        values: Signals and actions by row.
-        table: The table that the columns are from.
-        rows: The index of each row in that table.
-        run: Name of the run.
-    """
+    """Columns of one table of a run, by its name: time in s, signals and actions, and the place of each row there."""
 
     time: Float[np.ndarray, " rows"]
     values: Float[np.ndarray, "rows columns"]
