@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Annotated, get_args
+from typing import Annotated, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
@@ -21,6 +21,7 @@ from ruamel.yaml.nodes import MappingNode, Node
 
 from madoc.errors import UNPRINTABLE, MadocError, nearest_hint
 
+Whole = TypeVar("Whole", bound=BaseModel)
 Place = tuple[str | int, ...]
 """Path to a value: keys and positions, as `("signals", 0, "name")`."""
 
@@ -220,11 +221,12 @@ def refuse(wrong: bool, sentence: str) -> None:
         raise ValueError(sentence)
 
 
-@contextmanager
-def refused_with_line(document: Document, whole: type[BaseModel]) -> Iterator[None]:
-    """Turn pydantic's refusal of a file of this model inside the block into an error with the first mistake's line."""
+def validated(document: Document, whole: type[Whole], otherwise: str) -> Whole:
+    """A file as its model; the first mistake is refused with its line, and `otherwise` what has no keys at all."""
+    if not isinstance(document.data, dict):
+        raise document.error((), otherwise)
     try:
-        yield
+        return whole.model_validate(document.data)
     except ValidationError as error:
         # What is missing may be there under a misspelt name, which says more.
         details = sorted(
@@ -232,11 +234,12 @@ def refused_with_line(document: Document, whole: type[BaseModel]) -> Iterator[No
         )
         more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
         place = _place(details[0])
+        part: type[BaseModel] = whole
         for key in place[:-1]:
-            field = whole.model_fields.get(str(key))
+            field = part.model_fields.get(str(key))
             kinds = () if field is None else (field.annotation, *get_args(field.annotation))
-            whole = next((kind for kind in kinds if isinstance(kind, type) and issubclass(kind, BaseModel)), whole)
-        raise document.error(place, mistake(details[0], place, list(whole.model_fields)) + more) from error
+            part = next((kind for kind in kinds if isinstance(kind, type) and issubclass(kind, BaseModel)), part)
+        raise document.error(place, mistake(details[0], place, list(part.model_fields)) + more) from error
 
 
 def mistake(detail: ErrorDetails, place: Place, known: list[str]) -> str:

@@ -109,12 +109,8 @@ class Signals:
         reads = (read for expression in self.expressions for read in expression.reads)
         return frozenset(read.name for read in reads if read.kind == "sensor")
 
-    def observe(self, state: Batch) -> Batch:
-        """State -> observation."""
-        return self._stacked(self.expressions, state, None)
-
-    def sense(self, state: Batch, sensordata: Batch) -> Batch:
-        """State and sensordata -> observation."""
+    def observe(self, state: Batch, sensordata: Batch | None = None) -> Batch:
+        """State, and sensordata where signals read sensors -> observation."""
         return self._stacked(self.expressions, state, sensordata)
 
     def value(self, index: int, state: Batch) -> Batch:

@@ -18,7 +18,7 @@ from madoc.robots.document import (
     Unit,
     read_document,
     refuse,
-    refused_with_line,
+    validated,
 )
 from madoc.robots.drive_spec import ConditionSpec, DriveSpec, FrictionSpec, GearSpec
 from madoc.tasks import TASKS
@@ -256,7 +256,5 @@ class RobotSpec(Part):
 def read_spec(content: bytes, file: str) -> tuple[RobotSpec, Document]:
     """A spec and the lines of its parts, parsed once; the first mistake is refused with its line."""
     document = read_document(content, file)
-    if not isinstance(document.data, dict):
-        raise document.error((), "expected keys and values, as `name: my_robot`; write one with: madoc init MODEL")
-    with refused_with_line(document, RobotSpec):
-        return RobotSpec.model_validate(document.data), document
+    otherwise = "expected keys and values, as `name: my_robot`; write one with: madoc init MODEL"
+    return validated(document, RobotSpec, otherwise), document

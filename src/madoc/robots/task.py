@@ -150,7 +150,7 @@ def make_robot(content: bytes, file: str, files: ModelFiles, python: PythonFile 
         pending=pending,
         actions=actions,
         signals=names,
-        sense=signals.sense if signals.read_sensors else None,
+        sense=signals.observe if signals.read_sensors else None,
         rewarded=episode.rewarded,
         source={"file": file, "spec": content.decode("utf-8-sig"), "model": files.to_json()}
         | ({} if python is None else {"python": python.to_json()}),

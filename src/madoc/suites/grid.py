@@ -11,7 +11,7 @@ from typing import Literal
 from pydantic import Field
 
 from madoc.errors import MadocError
-from madoc.robots.document import Document, Part, Place, read_document, refused_with_line
+from madoc.robots.document import Document, Part, Place, read_document, validated
 
 GRID, ROBOTS, DATA = "grid", "robots", "data"
 """Keys of an entry that are no options: values to multiply out, and logs of several robots of one kind."""
@@ -60,10 +60,7 @@ def read_suite(path: Path) -> tuple[SuiteFile, Document]:
     document = read_document(
         path.read_bytes(), path.name, what="a suite file", remedy="write `madoc: 1` and a list of cells"
     )
-    if not isinstance(document.data, dict):
-        raise document.error((), "expected keys and values, `madoc: 1` and `cells:`")
-    with refused_with_line(document, SuiteFile):
-        return SuiteFile.model_validate(document.data), document
+    return validated(document, SuiteFile, "expected keys and values, `madoc: 1` and `cells:`"), document
 
 
 def combinations(suite: SuiteFile, document: Document, folder: Path) -> Iterator[Combination]:
