@@ -21,7 +21,7 @@ from madoc import tasks
 from madoc.report.reading import read_arrays
 from madoc.report.sections.estimates import plane_of
 from madoc.report.words import parameter_title
-from madoc.simulation.shapes import outlines
+from madoc.simulation.pictures import outlines
 from madoc.simulation.write import find_elements
 from madoc.tasks import Task
 

@@ -1,4 +1,4 @@
-"""Actions, drives, gears and friction of a spec: servos, limits and units, by hand, and what a model gets of them."""
+"""Drives, friction, gears, conditions and actions of a spec: what they make of the model, and what is refused."""
 
 import re
 

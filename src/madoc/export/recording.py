@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from madoc.errors import MadocError
 from madoc.simulation import Simulator
-from madoc.simulation.shapes import Solid, placed, solids
+from madoc.simulation.pictures import Solid, placed, solids
 
 if TYPE_CHECKING:
     from rerun import AsComponents, RecordingStream, TimeColumn

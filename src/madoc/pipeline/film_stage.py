@@ -17,9 +17,8 @@ from madoc.pipeline.orders import NO_PERMISSION, Permission
 from madoc.report.reading import read_arrays
 from madoc.runs.files import replacing
 from madoc.simulation import Simulator
-from madoc.simulation.pictures import pictures, side_camera
+from madoc.simulation.pictures import outlines, pictures, side_camera
 from madoc.simulation.rollout import act, reset_states
-from madoc.simulation.shapes import outlines
 from madoc.types import Policy
 
 FILM, MOTION = "film", "motion"
