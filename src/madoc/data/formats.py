@@ -1,4 +1,4 @@
-"""The formats of logged data and their readers. A new format is one module and one line of `FORMATS`."""
+"""The formats of logged data and their readers. A new format is one reader and one line of `FORMATS`."""
 
 import os
 from collections.abc import Callable
@@ -7,7 +7,7 @@ from pathlib import Path
 
 from jaxtyping import PRNGKeyArray
 
-from madoc.data import d4rl, minari_reader, native, neorl
+from madoc.data import minari_reader, native, offline_rl
 from madoc.data.dataset import Dataset, subsample
 from madoc.data.validation import require_file
 from madoc.errors import MadocError, unknown_name
@@ -31,8 +31,8 @@ class Format:
 
 
 FORMATS: dict[str, Format] = {
-    "d4rl": Format(d4rl.read, d4rl.recognises, "HDF5 with observations, actions, rewards, terminals"),
-    "neorl": Format(neorl.read, neorl.recognises, "npz with obs, next_obs, action, reward, done, index"),
+    "d4rl": Format(offline_rl.read_d4rl, offline_rl.is_d4rl, "HDF5 with observations, actions, rewards, terminals"),
+    "neorl": Format(offline_rl.read_neorl, offline_rl.is_neorl, "npz with obs, next_obs, action, reward, done, index"),
     "minari": Format(minari_reader.read, minari_reader.recognises, "a Minari directory or id"),
     "madoc": Format(native.read, native.recognises, "npz that madoc wrote"),
 }

@@ -1,4 +1,8 @@
-"""D4RL's HDF5 layout, v0 to v2 (Fu et al. 2020): one file with the rows of all episodes, one after another."""
+"""Data sets of offline reinforcement learning: the files of D4RL and of NeoRL.
+
+D4RL's HDF5 layout, v0 to v2 (Fu et al. 2020), is one file with the rows of all episodes, one after another. NeoRL's npz
+layout (Qin et al. 2022) has `obs` with root positions, and one `done` for falls and time limits.
+"""
 
 import re
 from dataclasses import replace
@@ -6,15 +10,24 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
-from madoc.data.archives import opened, size_of
+from madoc.data.archives import holds, opened, read_arrays, size_of
 from madoc.data.dataset import Dataset, close_episodes, starts_after
-from madoc.data.validation import LARGEST_DATASET, as_matrix, as_transitions, check_size, require_arrays, validate
+from madoc.data.validation import (
+    LARGEST_DATASET,
+    NAMES,
+    as_matrix,
+    as_transitions,
+    as_vector,
+    check_size,
+    require_arrays,
+    validate,
+)
 from madoc.errors import MadocError
 from madoc.tasks import Task
 
-NAMES_HERE = {
+D4RL_NAMES = {
     "observation": "observations",
     "action": "actions",
     "reward": "rewards",
@@ -22,17 +35,17 @@ NAMES_HERE = {
     "terminated": "terminals",
     "truncated": "timeouts",
 }
-OPTIONAL = {"next_observations", "timeouts"}
+D4RL_OPTIONAL = {"next_observations", "timeouts"}
 ANT_WIDTH, ANT_STATE_WIDTH = 111, 27
 """Values of D4RL's Ant: 27 of state, then contact forces of 14 bodies, which mujoco-py 2.x left at zero."""
 
 
-def recognises(path: Path) -> bool:
+def is_d4rl(path: Path) -> bool:
     """Whether the file begins like HDF5."""
     return path.is_file() and bool(h5py.is_hdf5(path))
 
 
-def read(path: Path, task: Task, *, clip_actions: bool = False) -> Dataset:
+def read_d4rl(path: Path, task: Task, *, clip_actions: bool = False) -> Dataset:
     """Read a D4RL file. `terminals` terminate, `timeouts` truncate.
 
     Without `next_observations` (v0) the next row's observation takes their place, and the last row of every episode is
@@ -43,7 +56,7 @@ def read(path: Path, task: Task, *, clip_actions: bool = False) -> Dataset:
     """
     arrays = _read_arrays(path)
     has_next = "next_observations" in arrays
-    names = NAMES_HERE if has_next else {**NAMES_HERE, "next_observation": "observations"}
+    names = D4RL_NAMES if has_next else {**D4RL_NAMES, "next_observation": "observations"}
     for name in {names["observation"], names["next_observation"]}:
         arrays[name] = _observation(arrays[name], name, task)
     transitions = as_transitions({"timeouts": np.zeros(len(arrays["terminals"])), **arrays}, names)
@@ -95,9 +108,77 @@ def _observation(values: np.ndarray, name: str, task: Task) -> Float[np.ndarray,
 
 def _read_arrays(path: Path) -> dict[str, np.ndarray]:
     with opened(path, "it is damaged, was cut short or has another format, copy or download it again") as file:
-        present = [name for name in NAMES_HERE.values() if isinstance(file.get(name), h5py.Dataset)]
+        present = [name for name in D4RL_NAMES.values() if isinstance(file.get(name), h5py.Dataset)]
         check_size(sum(size_of(file[name]) for name in present), f"the arrays of {path}", LARGEST_DATASET)
         arrays = {name: np.atleast_1d(file[name][()]) for name in present}
-    required = [name for name in NAMES_HERE.values() if name not in OPTIONAL]
+    required = [name for name in D4RL_NAMES.values() if name not in D4RL_OPTIONAL]
     require_arrays(arrays, required, path, "if it is a Minari file, pass its directory instead")
     return arrays
+
+
+NEORL_NAMES = {
+    **NAMES,
+    "observation": "obs",
+    "next_observation": "next_obs",
+    "terminated": "done",
+    "truncated": "done",
+}
+
+
+def is_neorl(path: Path) -> bool:
+    """Whether the file is an npz with `obs` and `next_obs`."""
+    return holds(path, "obs", "next_obs")
+
+
+def read_neorl(path: Path, task: Task, *, clip_actions: bool = False) -> Dataset:
+    """Read a NeoRL file. Its leading root positions, which never enter the dynamics, are dropped.
+
+    `done` marks falls and time limits alike: it terminates where the task ends at the state rebuilt from
+    `next_obs`, and truncates elsewhere. `index` holds episode ends in NeoRL's files and episode starts in
+    what its package returns (`neorl/utils.py` puts a 0 in front); both are read. Physics is legacy: NeoRL
+    used mujoco-py.
+    """
+    arrays = read_arrays(path)
+    require_arrays(arrays, (*NEORL_NAMES.values(), "index"), path, "pass the --format it has")
+    for name in ("obs", "next_obs"):
+        arrays[name] = _without_root(arrays[name], name, task)
+    transitions = as_transitions(arrays, NEORL_NAMES)
+    done = np.asarray(transitions.terminated)
+    terminated = done & np.asarray(task.terminated(_rebuild(arrays["next_obs"], task)), dtype=bool)
+    starts = _episode_starts(as_vector(arrays["index"], "index"), done)
+    transitions = close_episodes(replace(transitions, terminated=terminated, truncated=done & ~terminated), starts)
+    dataset = Dataset(transitions, starts, task_name=task.name, physics="legacy", origin=str(path))
+    return validate(dataset, task, NEORL_NAMES, clip_actions=clip_actions)
+
+
+def _rebuild(observation: np.ndarray, task: Task) -> np.ndarray:
+    if task.state_from_observation is None:
+        raise MadocError(
+            f"an observation of {task.name} does not determine its state, so falls and time limits of a NeoRL file "
+            "cannot be distinguished; give the task a state_from_observation, or convert the file"
+        )
+    return np.asarray(task.state_from_observation(observation))
+
+
+def _without_root(values: np.ndarray, name: str, task: Task) -> Float[np.ndarray, "rows observation"]:
+    observation = as_matrix(values, name)
+    width = _rebuild(np.zeros(task.observation_size), task).shape[-1]
+    if observation.shape[1] != width:
+        raise MadocError(
+            f"expected {width} values per observation for {task.name} (NeoRL keeps the root's position), "
+            f"got {observation.shape[1]} in row 0 of {name}; is this file of {task.name}?"
+        )
+    return np.ascontiguousarray(observation[:, width - task.observation_size :])
+
+
+def _episode_starts(index: np.ndarray, done: np.ndarray) -> Int[np.ndarray, " episodes"]:
+    """Starts from `index` (ends or starts) and from `done`: a row after either never continues an episode."""
+    rows = len(done)
+    wrong = np.flatnonzero((index < 0) | (index > rows) | (index != np.round(index)))
+    if len(wrong):
+        raise MadocError(
+            f"expected row numbers from 0 to {rows}, got {index[wrong[0]]:g} in row {wrong[0]} of index; "
+            "the file is damaged, make it again"
+        )
+    starts = np.union1d(np.append(0, index.astype(int)), np.flatnonzero(done) + 1)
+    return starts[starts < rows]
