@@ -21,6 +21,11 @@ _MOST_PAIRS = 20_000
 _LAGS = 96
 """Number of lags that are tried, spaced evenly in their logarithm."""
 
+STRETCHES = 10
+"""Number of stretches that a log of one episode is cut into, at least 2; some of them are held out."""
+_SHORTEST = 20
+"""Mean rows of a stretch, at least; of a shorter log of one episode the last rows are held out instead."""
+
 
 @dataclass(frozen=True)
 class Dataset:
@@ -207,12 +212,6 @@ def typical_change(dataset: Dataset, attitudes: Attitudes = ()) -> Float[np.ndar
     last = np.arange(len(dataset)) + rows - 1
     whole = last < dataset.episode_ends[dataset.episode_of(np.arange(len(dataset)))]
     return spread_of(differences(attitudes, following[last[whole]], observation[whole]))
-
-
-STRETCHES = 10
-"""Number of stretches that a log of one episode is cut into, at least 2; some of them are held out."""
-_SHORTEST = 20
-"""Mean rows of a stretch, at least; of a shorter log of one episode the last rows are held out instead."""
 
 
 @dataclass(frozen=True)

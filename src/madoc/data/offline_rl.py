@@ -39,6 +39,14 @@ D4RL_OPTIONAL = {"next_observations", "timeouts"}
 ANT_WIDTH, ANT_STATE_WIDTH = 111, 27
 """Values of D4RL's Ant: 27 of state, then contact forces of 14 bodies, which mujoco-py 2.x left at zero."""
 
+NEORL_NAMES = {
+    **NAMES,
+    "observation": "obs",
+    "next_observation": "next_obs",
+    "terminated": "done",
+    "truncated": "done",
+}
+
 
 def is_d4rl(path: Path) -> bool:
     """Whether the file begins like HDF5."""
@@ -114,15 +122,6 @@ def _read_arrays(path: Path) -> dict[str, np.ndarray]:
     required = [name for name in D4RL_NAMES.values() if name not in D4RL_OPTIONAL]
     require_arrays(arrays, required, path, "if it is a Minari file, pass its directory instead")
     return arrays
-
-
-NEORL_NAMES = {
-    **NAMES,
-    "observation": "obs",
-    "next_observation": "next_obs",
-    "terminated": "done",
-    "truncated": "done",
-}
 
 
 def is_neorl(path: Path) -> bool:

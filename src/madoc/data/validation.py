@@ -19,6 +19,11 @@ LARGEST_OF_ALL = 2_000_000_000
 LARGEST_DATASET = 4_000_000_000
 """Largest size of a data set of one of Madoc's own robots, bytes in memory: two million rows of an Ant have half."""
 
+ACTION_TOLERANCE = 1e-5
+"""Distance of an action from [-1, 1], up to which it is clipped silently as a rounding error; beyond, it is refused."""
+FLOATS = ("observation", "action", "reward", "next_observation")
+NAMES = {name: name for name in (*FLOATS, "terminated", "truncated")}
+
 
 def check_size(size: int, what: str, most: int) -> None:
     """Refuse what would take more memory than a bound, bytes, before it is read."""
@@ -26,12 +31,6 @@ def check_size(size: int, what: str, most: int) -> None:
         raise MadocError(
             f"{what} take {size:,} bytes of memory or more, at most {most:,} are read; split the log or record less"
         )
-
-
-ACTION_TOLERANCE = 1e-5
-"""Distance of an action from [-1, 1], up to which it is clipped silently as a rounding error; beyond, it is refused."""
-FLOATS = ("observation", "action", "reward", "next_observation")
-NAMES = {name: name for name in (*FLOATS, "terminated", "truncated")}
 
 
 def require_file(path: Path) -> None:

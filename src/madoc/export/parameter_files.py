@@ -29,6 +29,22 @@ OF_RANGES = (
 )
 """The first line of a file of ranges; an interval is wider than a patch's std says where the model may lack a term."""
 
+ACTUATOR = "mx64"
+"""BAM's class of a drive with a plain position loop and no current limit, in all of its versions. The numbers of a
+firmware are attributes of such an object, which its `load_model` does not read from the file, as Isaac Lab does."""
+_FRICTION = {
+    "stribeck": "friction_stribeck",
+    "stribeck_speed": "dtheta_stribeck",
+    "stribeck_exponent": "alpha",
+    "load_motor": "load_friction_motor",
+    "load_external": "load_friction_external",
+    "stribeck_load_motor": "load_friction_motor_stribeck",
+    "stribeck_load_external": "load_friction_external_stribeck",
+    "quadratic_motor": "load_friction_motor_quad",
+    "quadratic_external": "load_friction_external_quad",
+}
+"""BAM's names of the terms of friction, by ours; the units are the same."""
+
 
 @dataclass(frozen=True)
 class Exported:
@@ -161,23 +177,6 @@ def _single(values: Sequence[object]) -> object:
 def _write(path: Path, comment: str, content: object) -> None:
     with replacing(path) as stream:
         stream.write(f"# {comment}\n{yaml_text(content)}".encode())
-
-
-ACTUATOR = "mx64"
-"""BAM's class of a drive with a plain position loop and no current limit, in all of its versions. The numbers of a
-firmware are attributes of such an object, which its `load_model` does not read from the file, as Isaac Lab does."""
-_FRICTION = {
-    "stribeck": "friction_stribeck",
-    "stribeck_speed": "dtheta_stribeck",
-    "stribeck_exponent": "alpha",
-    "load_motor": "load_friction_motor",
-    "load_external": "load_friction_external",
-    "stribeck_load_motor": "load_friction_motor_stribeck",
-    "stribeck_load_external": "load_friction_external_stribeck",
-    "quadratic_motor": "load_friction_motor_quad",
-    "quadratic_external": "load_friction_external_quad",
-}
-"""BAM's names of the terms of friction, by ours; the units are the same."""
 
 
 def bam_files(folder: Path, drives: Sequence[JointDrive]) -> list[Path]:

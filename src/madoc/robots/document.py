@@ -40,6 +40,30 @@ MOST_KEYS = 1000
 MOST_PARTS = 20_000
 """Most values, keys, lists and mappings of a file; with more it is refused before it is read further."""
 
+_WORDS = {
+    "float_type": "a number",
+    "float_parsing": "a number",
+    "model_type": "keys and values",
+    "dataclass_type": "keys and values",
+    "dict_type": "keys and values",
+    "list_type": "a list",
+    "tuple_type": "a list",
+    "int_type": "a whole number",
+    "string_type": "text",
+    "path_type": "text",
+    "bool_type": "true or false",
+    "string_pattern_mismatch": "a printable name",
+}
+"""What was expected, by pydantic's name of the mistake."""
+LARGEST = 1e12
+"""Largest size of a number, in any unit: no range or limit of a robot reaches further."""
+_PRINTABLE = f"^[^{UNPRINTABLE}]+$"
+Name = Annotated[str, Field(min_length=1, max_length=100, pattern=_PRINTABLE)]
+File = Annotated[str, Field(min_length=1, max_length=4096, pattern=_PRINTABLE)]
+Unit = Annotated[str, Field(max_length=40, pattern=f"^[^{UNPRINTABLE}]*$")]
+Finite = Annotated[float, Field(allow_inf_nan=False, ge=-LARGEST, le=LARGEST)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, le=LARGEST)]
+
 
 @dataclass(frozen=True)
 class Document:
@@ -180,33 +204,6 @@ class _Constructor(RoundTripConstructor):
 
 # A date in a file, as the name of a folder of logs may be one, is text like any other word.
 _Constructor.add_constructor("tag:yaml.org,2002:timestamp", RoundTripConstructor.construct_yaml_str)
-
-
-_WORDS = {
-    "float_type": "a number",
-    "float_parsing": "a number",
-    "model_type": "keys and values",
-    "dataclass_type": "keys and values",
-    "dict_type": "keys and values",
-    "list_type": "a list",
-    "tuple_type": "a list",
-    "int_type": "a whole number",
-    "string_type": "text",
-    "path_type": "text",
-    "bool_type": "true or false",
-    "string_pattern_mismatch": "a printable name",
-}
-"""What was expected, by pydantic's name of the mistake."""
-
-
-LARGEST = 1e12
-"""Largest size of a number, in any unit: no range or limit of a robot reaches further."""
-_PRINTABLE = f"^[^{UNPRINTABLE}]+$"
-Name = Annotated[str, Field(min_length=1, max_length=100, pattern=_PRINTABLE)]
-File = Annotated[str, Field(min_length=1, max_length=4096, pattern=_PRINTABLE)]
-Unit = Annotated[str, Field(max_length=40, pattern=f"^[^{UNPRINTABLE}]*$")]
-Finite = Annotated[float, Field(allow_inf_nan=False, ge=-LARGEST, le=LARGEST)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, le=LARGEST)]
 
 
 class Part(BaseModel):

@@ -24,6 +24,9 @@ _LOAD = {"load": 0.5, "stribeck_load": 1.0, "quadratic": 0.1}
 """Largest ratio of friction to load, as Rhoban/bam's fits have it, and the largest quadratic one in 1/(N·m), ten
 times theirs."""
 
+KNOWN_UNITS = (*SCALES, "N·m", "Nm", "N", "rad", "rad/s", "m", "m/s", "V", "A", "%", "1")
+"""Units of an action. Those of `SCALES` are converted; in the others a value is the control itself."""
+
 
 def drive_numbers(drive: DriveSpec, means: str, encoder: float) -> tuple[float, ...]:
     """The numbers of a drive in the model, in the order of `DRIVE`; what it takes from the log comes in later."""
@@ -234,10 +237,6 @@ def _has_servo(draft: Draft, joint: str) -> bool:
         int(actuator.trntype) in OF_A_JOINT and actuator.target == joint and any(actuator.biasprm[1:3])
         for actuator in draft.base.actuators
     )
-
-
-KNOWN_UNITS = (*SCALES, "N·m", "Nm", "N", "rad", "rad/s", "m", "m/s", "V", "A", "%", "1")
-"""Units of an action. Those of `SCALES` are converted; in the others a value is the control itself."""
 
 
 def added_actuator(draft: Draft, index: int) -> AddedActuator | None:

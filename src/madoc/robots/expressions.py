@@ -34,6 +34,30 @@ LOGIC: dict[str, Callable[[list[Any]], Any]] = {
 _OF_ARRAYS = {"min": "minimum", "max": "maximum"}
 """Functions that the array API calls otherwise."""
 
+READS = ("position", "velocity", "sensor")
+"""What may be read of a joint or a sensor."""
+DRAWS = ("uniform", "normal")
+"""Random numbers, by the two values that each takes: low and high, or mean and standard deviation."""
+LONGEST = 500
+"""Longest expression in characters; a longer one is refused."""
+LARGEST = 1e15
+"""Largest size of a number in an expression, written or computed, and of a weight; a larger one is refused."""
+_BINARY: dict[type, Callable[[Batch, Batch], Batch]] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+    ast.Pow: operator.pow,
+}
+_UNARY: dict[type, Callable[[Batch], Batch]] = {ast.UAdd: operator.pos, ast.USub: operator.neg}
+_COMPARISONS: dict[type, Callable[[Batch, Batch], Batch]] = {
+    ast.Lt: operator.lt,
+    ast.LtE: operator.le,
+    ast.Gt: operator.gt,
+    ast.GtE: operator.ge,
+}
+_JOINED: dict[type, str] = {ast.And: "logical_and", ast.Or: "logical_or"}
+
 
 @dataclass(frozen=True)
 class Read:
@@ -148,32 +172,6 @@ def weighted_sum(node: Node) -> Sum | None:
 
 def _scaled(affine: Sum, factor: float) -> Sum:
     return {read: weight * factor for read, weight in affine[0].items()}, affine[1] * factor
-
-
-READS = ("position", "velocity", "sensor")
-"""What may be read of a joint or a sensor."""
-DRAWS = ("uniform", "normal")
-"""Random numbers, by the two values that each takes: low and high, or mean and standard deviation."""
-LONGEST = 500
-"""Longest expression in characters; a longer one is refused."""
-LARGEST = 1e15
-"""Largest size of a number in an expression, written or computed, and of a weight; a larger one is refused."""
-
-_BINARY: dict[type, Callable[[Batch, Batch], Batch]] = {
-    ast.Add: operator.add,
-    ast.Sub: operator.sub,
-    ast.Mult: operator.mul,
-    ast.Div: operator.truediv,
-    ast.Pow: operator.pow,
-}
-_UNARY: dict[type, Callable[[Batch], Batch]] = {ast.UAdd: operator.pos, ast.USub: operator.neg}
-_COMPARISONS: dict[type, Callable[[Batch, Batch], Batch]] = {
-    ast.Lt: operator.lt,
-    ast.LtE: operator.le,
-    ast.Gt: operator.gt,
-    ast.GtE: operator.ge,
-}
-_JOINED: dict[type, str] = {ast.And: "logical_and", ast.Or: "logical_or"}
 
 
 @dataclass(frozen=True)

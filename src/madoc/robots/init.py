@@ -74,7 +74,7 @@ def spec_text(model: Path, out: Path, *, allow_outside: bool = False, recipe: st
     if not actions:
         what = "no actuator has a name" if made.nu else "it has no actuator, and no joint that turns or slides"
         raise MadocError(f"no action of {model} can be written: {what}; add one to the model, by name")
-    added = tuple(one for one in (_added(made, fields) for fields, _ in actions) if one is not None)
+    added = tuple(one for one in (_added(fields) for fields, _ in actions) if one is not None)
     driven, guessed = compiled(partial(make_model, base, added), files.main), frozenset(one.name for one in added)
     timestep = float(made.opt.timestep)
     step = timestep * max(1, round(_USUAL_STEP / timestep))
@@ -209,7 +209,7 @@ def _command_ends(model: mujoco.MjModel, actuator: str) -> tuple[tuple[float, fl
     return (-most, most), "  # the model has no ctrlrange: write its limits"
 
 
-def _added(model: mujoco.MjModel, fields: Fields) -> AddedActuator | None:
+def _added(fields: Fields) -> AddedActuator | None:
     """The actuator that an action of this spec adds to the model, so that its gains can be proposed too."""
     if "joint" not in fields:
         return None

@@ -63,6 +63,12 @@ LARGEST_MEMORY = 2**30
 """Most memory that a model may ask for, bytes."""
 _UNITS = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40, "p": 2**50, "e": 2**60}
 
+LARGEST = 100_000_000
+"""Largest size of all files of a model together, bytes; more is refused."""
+LARGEST_XML = 10_000_000
+"""Largest size of one XML file of a model, bytes; a larger one is refused."""
+_PNG = b"\x89PNG\r\n\x1a\n"
+
 
 @dataclass(frozen=True)
 class Element:
@@ -206,13 +212,6 @@ def _numbers(text: str) -> list[float]:
         return [float(word) for word in text.split()]
     except ValueError:
         return []
-
-
-LARGEST = 100_000_000
-"""Largest size of all files of a model together, bytes; more is refused."""
-LARGEST_XML = 10_000_000
-"""Largest size of one XML file of a model, bytes; a larger one is refused."""
-_PNG = b"\x89PNG\r\n\x1a\n"
 
 
 @dataclass(frozen=True)

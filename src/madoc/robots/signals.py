@@ -25,6 +25,22 @@ from madoc.tasks.base import Batch
 Span = tuple[int, int]
 """Address of the first value, and number of values."""
 
+_NOT_SI = re.compile(
+    r"\b(deg\w*|grad|mrad|rev|revolutions?|rpm|turns?|mm|cm|km|inch(es)?|ft|feet|foot)\b|°|/min\b", re.IGNORECASE
+)
+"""Units of length, angle and speed that are not m, rad, m/s or rad/s."""
+_FIRST_OF_QUATERNION = {int(mujoco.mjtJoint.mjJNT_FREE): 3, int(mujoco.mjtJoint.mjJNT_BALL): 0}
+"""Index of the quaternion's first component among the positions of a joint of this type."""
+_QUATERNION_SENSORS = (int(mujoco.mjtSensor.mjSENS_FRAMEQUAT), int(mujoco.mjtSensor.mjSENS_BALLQUAT))
+_FRAMES = {
+    mujoco.mjtObj.mjOBJ_XBODY: "xmat",
+    mujoco.mjtObj.mjOBJ_BODY: "ximat",
+    mujoco.mjtObj.mjOBJ_GEOM: "geom_xmat",
+    mujoco.mjtObj.mjOBJ_SITE: "site_xmat",
+    mujoco.mjtObj.mjOBJ_CAMERA: "cam_xmat",
+}
+"""The axes of what a sensor is fixed to, in MjData."""
+
 
 @dataclass(frozen=True)
 class Layout:
@@ -203,24 +219,6 @@ def _scaled_rows(forward: Float[np.ndarray, "signals state"]) -> tuple[np.ndarra
     scale = np.abs(forward).max(1, initial=0.0, keepdims=True)
     even = np.divide(forward, scale, out=np.zeros_like(forward), where=scale > 0)
     return even, np.where(scale > 0, scale, 1.0)
-
-
-_NOT_SI = re.compile(
-    r"\b(deg\w*|grad|mrad|rev|revolutions?|rpm|turns?|mm|cm|km|inch(es)?|ft|feet|foot)\b|°|/min\b", re.IGNORECASE
-)
-"""Units of length, angle and speed that are not m, rad, m/s or rad/s."""
-_FIRST_OF_QUATERNION = {int(mujoco.mjtJoint.mjJNT_FREE): 3, int(mujoco.mjtJoint.mjJNT_BALL): 0}
-"""Index of the quaternion's first component among the positions of a joint of this type."""
-_QUATERNION_SENSORS = (int(mujoco.mjtSensor.mjSENS_FRAMEQUAT), int(mujoco.mjtSensor.mjSENS_BALLQUAT))
-
-_FRAMES = {
-    mujoco.mjtObj.mjOBJ_XBODY: "xmat",
-    mujoco.mjtObj.mjOBJ_BODY: "ximat",
-    mujoco.mjtObj.mjOBJ_GEOM: "geom_xmat",
-    mujoco.mjtObj.mjOBJ_SITE: "site_xmat",
-    mujoco.mjtObj.mjOBJ_CAMERA: "cam_xmat",
-}
-"""The axes of what a sensor is fixed to, in MjData."""
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,9 @@ LEAST_FRICTION = 1e-9
 """Coulomb friction in N·m to which smaller values are raised at a joint whose friction depends on speed or load: MuJoCo
 makes a constraint only of friction above 0."""
 
+SUFFIX = "_gear"
+"""What the names of a gear's joint and tendon end with, behind that of the joint it belongs to."""
+
 
 def has_numbers(model: mujoco.MjModel, actuator: int) -> bool:
     """Whether an actuator is a d.c. drive, or brings in a number of one."""
@@ -143,10 +146,6 @@ def scale_forces(model: mujoco.MjModel, factor: float) -> None:
         if has_speed_or_load_friction(model, joint):
             model.jnt_user[joint, FRICTION.index("stribeck")] *= factor
             model.jnt_user[joint, FRICTION.index("quadratic_motor") :] /= factor
-
-
-SUFFIX = "_gear"
-"""What the names of a gear's joint and tendon end with, behind that of the joint it belongs to."""
 
 
 def deflections(model: mujoco.MjModel) -> Int[np.ndarray, " gears"]:

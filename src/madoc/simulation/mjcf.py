@@ -35,6 +35,33 @@ NOT_COMPARED = ("_", "bvh", "cam_", "geom_rgba", "light_", "mat_", "mesh_", "oct
 
 _LONG_NUMBER = re.compile(r'(?<=["\s])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?=["\s])')
 
+_ATTRIBUTES = {
+    "qpos0": "ref",
+    "jnt_user": "userdata",
+    "actuator_user": "userdata",
+    "qpos_spring": "springref",
+    "dof_solref": "solref_friction",
+    "dof_solimp": "solimp_friction",
+    "jnt_solref": "solref_limit",
+    "jnt_solimp": "solimp_limit",
+    "tendon_solref_lim": "solref_limit",
+    "tendon_solimp_lim": "solimp_limit",
+    "tendon_solref_fri": "solref_friction",
+    "tendon_solimp_fri": "solimp_friction",
+    "tendon_lengthspring": "springlength",
+}
+"""Attributes in MJCF of arrays whose name is not that of the attribute behind the kind of element."""
+_INERTIAL = ("body_mass", "body_inertia", "body_ipos", "body_iquat")
+"""Arrays that are written as the inertial frame of a body."""
+_ANGLES = ("ref", "springref", "range")
+"""Attributes of a hinge that are in degrees where the other angles of a model's file are."""
+Numbers = Mapping[str, tuple[Int[np.ndarray, " numbers"], Num[np.ndarray, "draws numbers"]]]
+"""For each array of `mujoco.MjModel` the places in it that change, of its values in a row, and what they are."""
+BOXES = "bvh_aabb"
+"""Boxes about geoms, by which MuJoCo finds contacts faster."""
+GRAVITY = "opt.gravity"
+"""The one array of a model's options that a parameter writes."""
+
 
 @dataclass(frozen=True)
 class Change:
@@ -258,38 +285,6 @@ def _body_name(model: mujoco.MjModel, index: int) -> str:
     body = model.body(index)
     joint = model.body_jntadr[index]
     return body.name or (model.joint(joint).name if joint >= 0 else "") or str(index)
-
-
-_ATTRIBUTES = {
-    "qpos0": "ref",
-    "jnt_user": "userdata",
-    "actuator_user": "userdata",
-    "qpos_spring": "springref",
-    "dof_solref": "solref_friction",
-    "dof_solimp": "solimp_friction",
-    "jnt_solref": "solref_limit",
-    "jnt_solimp": "solimp_limit",
-    "tendon_solref_lim": "solref_limit",
-    "tendon_solimp_lim": "solimp_limit",
-    "tendon_solref_fri": "solref_friction",
-    "tendon_solimp_fri": "solimp_friction",
-    "tendon_lengthspring": "springlength",
-}
-"""Attributes in MJCF of arrays whose name is not that of the attribute behind the kind of element."""
-
-_INERTIAL = ("body_mass", "body_inertia", "body_ipos", "body_iquat")
-"""Arrays that are written as the inertial frame of a body."""
-
-_ANGLES = ("ref", "springref", "range")
-"""Attributes of a hinge that are in degrees where the other angles of a model's file are."""
-
-
-Numbers = Mapping[str, tuple[Int[np.ndarray, " numbers"], Num[np.ndarray, "draws numbers"]]]
-"""For each array of `mujoco.MjModel` the places in it that change, of its values in a row, and what they are."""
-BOXES = "bvh_aabb"
-"""Boxes about geoms, by which MuJoCo finds contacts faster."""
-GRAVITY = "opt.gravity"
-"""The one array of a model's options that a parameter writes."""
 
 
 def numbers_of_draws(simulator: Simulator, values: Float[np.ndarray, "draws parameters"]) -> Numbers:

@@ -25,6 +25,26 @@ _FLAT = (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD))
 _LENGTHWISE = (int(mujoco.mjtGeom.mjGEOM_CAPSULE), int(mujoco.mjtGeom.mjGEOM_CYLINDER))
 """Geoms whose radius and half-length are their first two sizes, along z."""
 
+_KINDS = {
+    int(mujoco.mjtGeom.mjGEOM_SPHERE): "ellipsoid",
+    int(mujoco.mjtGeom.mjGEOM_ELLIPSOID): "ellipsoid",
+    int(mujoco.mjtGeom.mjGEOM_CAPSULE): "capsule",
+    int(mujoco.mjtGeom.mjGEOM_CYLINDER): "cylinder",
+    int(mujoco.mjtGeom.mjGEOM_BOX): "box",
+    int(mujoco.mjtGeom.mjGEOM_MESH): "mesh",
+}
+"""What a geom is; planes and terrain are ground, and others are not drawn."""
+_SHOWN = 3
+"""Groups of geoms that MuJoCo's own viewer shows, from 0; the others are for collisions, as a rule."""
+LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}
+"""The ways to OpenGL without a screen, as MuJoCo's `MUJOCO_GL` names them, and the library that each needs."""
+TIMEOUT = 30.0
+"""Longest time in s that drawing may take with each of them, after which it is stopped."""
+DRAWING = 8.0
+"""Time in s that drawing may take; where it takes longer, some pictures stand for those after them."""
+PAPER, BODY, GHOST = (255, 255, 255), ((31, 111, 214), 230), ((13, 153, 102), 100)
+"""Colours of outlines: what is behind them, and their own with an opacity of 255."""
+
 
 def outlines(
     model: mujoco.MjModel, states: Float[np.ndarray, "frames state"]
@@ -58,19 +78,6 @@ def _segment(model: mujoco.MjModel, geom: int) -> tuple[Float[np.ndarray, "ends 
     radius = float(np.delete(sides, longest).mean())
     reach = np.eye(3)[longest] * max(0.0, float(sides[longest]) - radius)
     return np.array([centre - reach, centre + reach]), radius
-
-
-_KINDS = {
-    int(mujoco.mjtGeom.mjGEOM_SPHERE): "ellipsoid",
-    int(mujoco.mjtGeom.mjGEOM_ELLIPSOID): "ellipsoid",
-    int(mujoco.mjtGeom.mjGEOM_CAPSULE): "capsule",
-    int(mujoco.mjtGeom.mjGEOM_CYLINDER): "cylinder",
-    int(mujoco.mjtGeom.mjGEOM_BOX): "box",
-    int(mujoco.mjtGeom.mjGEOM_MESH): "mesh",
-}
-"""What a geom is; planes and terrain are ground, and others are not drawn."""
-_SHOWN = 3
-"""Groups of geoms that MuJoCo's own viewer shows, from 0; the others are for collisions, as a rule."""
 
 
 @dataclass(frozen=True)
@@ -133,16 +140,6 @@ def _solid(model: mujoco.MjModel, geom: int) -> Solid:
     body = model.body(model.geom_bodyid[geom]).name or f"body_{model.geom_bodyid[geom]}"
     name = model.geom(geom).name or f"{body}_{geom}"
     return Solid(name, geom, kind, np.array(size, float), colour.astype(np.float64), vertices, np.array(faces))
-
-
-LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}
-"""The ways to OpenGL without a screen, as MuJoCo's `MUJOCO_GL` names them, and the library that each needs."""
-TIMEOUT = 30.0
-"""Longest time in s that drawing may take with each of them, after which it is stopped."""
-DRAWING = 8.0
-"""Time in s that drawing may take; where it takes longer, some pictures stand for those after them."""
-PAPER, BODY, GHOST = (255, 255, 255), ((31, 111, 214), 230), ((13, 153, 102), 100)
-"""Colours of outlines: what is behind them, and their own with an opacity of 255."""
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,16 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+_OF_CONSTRAINTS = tuple(
+    int(getattr(mujoco.mjtSensor, f"mjSENS_{name}"))
+    for name in ("JOINTLIMITPOS", "JOINTLIMITVEL", "TENDONLIMITPOS", "TENDONLIMITVEL", "USER", "PLUGIN")
+)
+"""Sensors that may show constraints though they belong to positions or velocities."""
+_TRIED = 8
+"""Number of states beyond those that determine the weights; a sensor that is no weighted sum differs in one of them."""
+_EXACT = 1e-9
+"""Largest error of a weighted sum, relative to the sensor's largest reading; weights below it are rounding."""
+
 
 def collided(
     model: mujoco.MjModel, data: mujoco.MjData, states: Float[np.ndarray, "rows state"]
@@ -33,13 +43,6 @@ def touching_geoms(model: mujoco.MjModel, states: Float[np.ndarray, "rows state"
             known = pair[named[pair]]
             found.update((known[moves[known]] if moves[known].any() else known).tolist())
     return tuple(model.geom(index).name for index in sorted(found))
-
-
-_OF_CONSTRAINTS = tuple(
-    int(getattr(mujoco.mjtSensor, f"mjSENS_{name}"))
-    for name in ("JOINTLIMITPOS", "JOINTLIMITVEL", "TENDONLIMITPOS", "TENDONLIMITVEL", "USER", "PLUGIN")
-)
-"""Sensors that may show constraints though they belong to positions or velocities."""
 
 
 @contextmanager
@@ -91,12 +94,6 @@ def drive_forces(
         share = np.clip(total, *model.jnt_actfrcrange[joint]) / np.where(total == 0.0, 1.0, total)
         forces[..., dof] *= share[:, None]
     return forces
-
-
-_TRIED = 8
-"""Number of states beyond those that determine the weights; a sensor that is no weighted sum differs in one of them."""
-_EXACT = 1e-9
-"""Largest error of a weighted sum, relative to the sensor's largest reading; weights below it are rounding."""
 
 
 def linear_sensors(model: mujoco.MjModel) -> dict[int, Float[np.ndarray, "values physical"]]:

@@ -46,6 +46,10 @@ _FORCES = (
 )
 """Arrays of a model whose numbers are masses, forces or torques, or in proportion to them."""
 
+ROWS = (64, 512, 4096)
+"""Number of logged rows in which a parameter is tried, one after the other as long as it changes nothing: contacts may
+be rare."""
+
 
 @dataclass(frozen=True)
 class DrivenJoint:
@@ -174,11 +178,6 @@ def _stepped(
             mujoco.mj_step(model, data, nstep=task.frame_skip)
             seen.append(np.concatenate([data.qpos, data.qvel, data.sensordata if task.sense else []]))
     return np.stack(seen)
-
-
-ROWS = (64, 512, 4096)
-"""Number of logged rows in which a parameter is tried, one after the other as long as it changes nothing: contacts may
-be rare."""
 
 
 def insensitive(

@@ -17,6 +17,14 @@ from madoc.errors import MadocError
 from madoc.simulation.attitudes import Tangent, differences
 from madoc.tasks.base import Task
 
+STANDING = 0.01
+"""Height of a point above the lowest one, relative to the base's own, up to which it counts as standing."""
+LEVEL, UPRIGHT = 0.01, 0.99
+"""Largest vertical part of the axis of a base's slide in the plane, and smallest of one that is its height."""
+_Pairs = tuple[tuple[int, int], ...]
+_PLACINGS = 3
+"""Number of times that a base is lowered by its distance; once is enough on a plane."""
+
 
 def velocities_between(
     task: Task,
@@ -87,15 +95,6 @@ def refuse_unseen_positions(task: Task) -> None:
             f"an observation of {task.name} does not show the position of {', '.join(joints)}, so its velocity cannot "
             "be computed from positions; use least-squares, which estimates it, or madoc with starts=policy"
         )
-
-
-STANDING = 0.01
-"""Height of a point above the lowest one, relative to the base's own, up to which it counts as standing."""
-LEVEL, UPRIGHT = 0.01, 0.99
-"""Largest vertical part of the axis of a base's slide in the plane, and smallest of one that is its height."""
-_Pairs = tuple[tuple[int, int], ...]
-_PLACINGS = 3
-"""Number of times that a base is lowered by its distance; once is enough on a plane."""
 
 
 @dataclass(frozen=True)

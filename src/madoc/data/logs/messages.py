@@ -15,6 +15,9 @@ from madoc.data.logs.tables import WIDEST, Run, Table
 from madoc.data.validation import LARGEST, check_size
 from madoc.errors import MadocError
 
+if TYPE_CHECKING:
+    from mcap.records import Chunk
+
 CLOCK = "log_time"
 MOST_NAMES = 10_000
 """Number of columns of a topic that are known by name, beside those that are asked for."""
@@ -23,6 +26,16 @@ _OF_TIMES = 200
 EXTRA = 'pip install "madoc-calibration[logs]"'
 
 Decoder = Callable[[bytes], object]
+
+LARGEST_CHUNK = 200_000_000
+"""Largest size of a chunk, bytes when unpacked; recorders write chunks of a million or less."""
+_MOST_OF_LZ4 = 255
+"""Largest ratio by which LZ4 packs."""
+_ROWS_OF_BAG = """
+SELECT topics.name, topics.type, topics.serialization_format, messages.timestamp, messages.data
+FROM messages JOIN topics ON messages.topic_id = topics.id ORDER BY messages.timestamp, messages.id
+"""
+_DEFINITIONS = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
 
 
 @dataclass(frozen=True)
@@ -123,7 +136,7 @@ def run_of(path: Path, messages: Iterable[Message], wanted: Collection[str]) -> 
         raise MadocError(f"expected topics of JSON or ROS 2 messages in {path.name}, got {what}; convert it to CSV")
     others = {topic: f"a topic of {encoding} encoding" for topic, encoding in unknown.items()}
     origin = min(topic.times[0][0] for topic in topics.values())
-    return Run(path.name, tuple(_table(name, topic, origin, others) for name, topic in topics.items()))
+    return Run(path.name, tuple(_table(topic, origin, others) for topic in topics.values()))
 
 
 def _decoder(topic: str, kind: Kind) -> Decoder | None:
@@ -198,22 +211,13 @@ def _stamp(content: object) -> int | None:
     return int(seconds) * 1_000_000_000 + int(nanoseconds)
 
 
-def _table(name: str, topic: _Topic, origin: int, others: Mapping[str, str]) -> Table:
+def _table(topic: _Topic, origin: int, others: Mapping[str, str]) -> Table:
     """Messages as columns, in the order of logging."""
     columns = {key: np.array(values) for key, values in topic.columns.items()}
     for clock, times in zip((CLOCK, "publish_time", "header.stamp"), zip(*topic.times, strict=True), strict=True):
         if None not in times:
             columns[clock] = (np.array(times, dtype=np.int64) - origin) / 1e9
     return Table(columns, CLOCK, others=others, unread=[key for key in topic.names if key not in columns])
-
-
-if TYPE_CHECKING:
-    from mcap.records import Chunk
-
-LARGEST_CHUNK = 200_000_000
-"""Largest size of a chunk, bytes when unpacked; recorders write chunks of a million or less."""
-_MOST_OF_LZ4 = 255
-"""Largest ratio by which LZ4 packs."""
 
 
 def read_mcap(path: Path, wanted: Collection[str]) -> list[Run]:
@@ -264,13 +268,6 @@ def _unpacked_size(chunk: "Chunk") -> int:
 
         return len(LZ4FrameDecompressor().decompress(chunk.data, max_length=LARGEST_CHUNK + 1))
     return 0
-
-
-_ROWS_OF_BAG = """
-SELECT topics.name, topics.type, topics.serialization_format, messages.timestamp, messages.data
-FROM messages JOIN topics ON messages.topic_id = topics.id ORDER BY messages.timestamp, messages.id
-"""
-_DEFINITIONS = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
 
 
 def read_bag(path: Path, wanted: Collection[str]) -> list[Run]:

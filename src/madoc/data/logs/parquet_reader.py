@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     import pyarrow
     import pyarrow.parquet
 
+CLOCK = "timestamp"
+
 
 def read(path: Path, wanted: Collection[str]) -> list[Run]:
     """One run. The elements of a list column `position` are the columns `position[0]`, ..."""
@@ -135,9 +137,6 @@ def _column(column: "pyarrow.ChunkedArray", path: Path) -> np.ndarray:
         rows = [[np.nan] * lengths[0] if row is None else row for row in column.to_pylist()]
         return np.array(rows, dtype=np.float64)
     return np.asarray(compute.list_flatten(column).to_numpy()).reshape(len(column), lengths[0])
-
-
-CLOCK = "timestamp"
 
 
 def is_lerobot(path: Path) -> bool:
