@@ -11,11 +11,11 @@ from pathlib import Path
 
 from madoc.data.dataset import Dataset
 from madoc.data.findings import Finding
-from madoc.data.logs import csv_reader, parquet_reader
-from madoc.data.logs.array_readers import read_hdf5, read_minari, read_npz
+from madoc.data.logs import parquet_reader
 from madoc.data.logs.assembly import assemble, wanted_columns
 from madoc.data.logs.jumps import split_episodes, without_copies
 from madoc.data.logs.messages import read_bag, read_mcap
+from madoc.data.logs.readers import read_csv, read_hdf5, read_minari, read_npz
 from madoc.data.logs.tables import Run
 from madoc.data.minari_reader import recognises as is_minari
 from madoc.data.validation import LARGEST_OF_ALL, check_size, require_file, validate
@@ -23,7 +23,7 @@ from madoc.errors import MadocError, listed
 from madoc.robots import Robot
 
 _READERS: dict[str, Callable[[Path, Collection[str]], list[Run]]] = {
-    **dict.fromkeys((".csv", ".tsv", ".txt"), csv_reader.read),
+    **dict.fromkeys((".csv", ".tsv", ".txt"), read_csv),
     ".npz": read_npz,
     **dict.fromkeys((".h5", ".hdf5", ".hdf"), read_hdf5),
     **dict.fromkeys((".parquet", ".pq"), parquet_reader.read),
