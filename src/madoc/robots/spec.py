@@ -25,14 +25,8 @@ from madoc.tasks import TASKS
 
 SHORTEST_TIMESTEP = 1e-6
 """Shortest timestep in s: contacts of rigid bodies last a thousand times as long."""
-LONGEST_TIMESTEP = 1.0
-"""Longest timestep in s; no robot is stable with one a tenth as long."""
 LONGEST_STEP = 60.0
 """Longest control step in s."""
-MOST_STEPS = 10_000
-"""Largest number of physics steps of a control step."""
-MOST_PENDING = 1000
-"""Largest number of control steps that an action may be late."""
 
 SCALES: dict[str, float] = {
     **dict.fromkeys(("deg", "deg/s", "°", "°/s"), math.pi / 180.0),

@@ -27,17 +27,17 @@ from madoc.robots.model import Draft, compiled, make_model, read_model, with_who
 from madoc.robots.model_files import ModelFiles
 from madoc.robots.signals import attitudes_of, quaternion_of, read_signals, signal_unit, turn_of
 from madoc.robots.space import parameter_space
-from madoc.robots.spec import (
-    LONGEST_TIMESTEP,
-    MOST_PENDING,
-    MOST_STEPS,
-    SHORTEST_TIMESTEP,
-    RobotSpec,
-    read_spec,
-)
+from madoc.robots.spec import SHORTEST_TIMESTEP, RobotSpec, read_spec
 from madoc.simulation.delay import pending_actions
 from madoc.simulation.write import diagonal_bodies
 from madoc.tasks.base import ActionChannel, Batch, Task, never_terminated
+
+LONGEST_TIMESTEP = 1.0
+"""Longest timestep in s; no robot is stable with one a tenth as long."""
+MOST_STEPS = 10_000
+"""Largest number of physics steps of a control step."""
+MOST_PENDING = 1000
+"""Largest number of control steps that an action may be late."""
 
 
 @dataclass(frozen=True)
