@@ -7,7 +7,7 @@ from pathlib import Path
 import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
-from paper_cells import asked, how_far, kept, planned, wanted
+from paper_cells import how_far, kept, planned, wanted
 from scipy import stats
 
 from madoc.calibration.madoc import grouping
@@ -85,7 +85,7 @@ def table(name: str) -> str:
     plan, found = planned(name), kept(name)
     by_method = defaultdict[str, dict[int, dict]](dict)
     for cell in wanted(plan):
-        by_method[asked(cell)["method"]][asked(cell).get("seed", 0)] = found.get(cell.name, {})
+        by_method[cell.asks["method"]][cell.asks.get("seed", 0)] = found.get(cell.name, {})
     seeds = sorted({seed for rows in by_method.values() for seed in rows})
     lines = [
         f"{how_far(name, wanted(plan))}.\n",

@@ -117,7 +117,7 @@ class Suite:
 
 def _listed(standing: "Standing", out: Path, workers: int) -> Answer:
     """The cells, a line each, and the forecast."""
-    from madoc.suites.listing import lines, rows
+    from madoc.suites.standing import lines, rows
 
     told = standing.forecast()
     listed = rows(standing)

@@ -10,7 +10,7 @@ from typing import Any, Literal
 from madoc.errors import MadocError, unknown_name
 from madoc.pipeline.orders import CalibrationOrder, EvaluationOrder, PolicyOrder, RecordOrder
 from madoc.runs.files import read_bytes, replacing
-from madoc.suites.options import Order, adapter
+from madoc.suites.options import Order, adapter, flat
 
 Kind = Literal["record", "calibrate", "learn", "evaluate"]
 
@@ -51,6 +51,11 @@ class Cell:
     def read(self) -> Order:
         """The order itself."""
         return adapter(KINDS[self.kind]).validate_python(dict(self.order))
+
+    @property
+    def asks(self) -> dict[str, Any]:
+        """What it asks, by the keys of a suite file; values left at their default are not among them."""
+        return flat(KINDS[self.kind], self.order)
 
     def folder(self, suite: Path) -> Path:
         """Its run folder inside the folder of a suite."""

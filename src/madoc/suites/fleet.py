@@ -10,8 +10,6 @@ import numpy as np
 from madoc.calibration.result import ParameterEstimate
 from madoc.identification.information import NORMAL_95
 from madoc.identification.random_effects import Common, common, outliers
-from madoc.suites.cells import KINDS
-from madoc.suites.options import flat
 from madoc.suites.results import Result
 
 _FEWEST = 2
@@ -69,7 +67,7 @@ def fleets(results: Iterable[Result]) -> list[Fleet]:
     groups = defaultdict[str, dict[str, Result]](dict)
     for result in results:
         if result.cell.robot and result.cell.kind == "calibrate":
-            asked = flat(KINDS["calibrate"], result.cell.order)
+            asked = result.cell.asks
             asked.pop("data", None)
             groups[json.dumps([result.cell.entry, asked])][result.cell.robot] = result
     return [_fleet(title, robots) for title, robots in groups.items()]

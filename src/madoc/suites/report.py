@@ -12,10 +12,9 @@ from madoc.report.words import TONES
 from madoc.runs.files import write_json
 from madoc.suites.cells import Cell
 from madoc.suites.fleet import Fleet, fleets, ranges
-from madoc.suites.listing import asked
 from madoc.suites.planning import Plan
 from madoc.suites.results import NOT_RUN, Result, results_of, rows, write_csv, write_parquet
-from madoc.suites.standing import Standing
+from madoc.suites.standing import Standing, asked
 
 LARGEST_PAGE = 2000
 """Largest number of single cells on the page; the tables have all."""

@@ -14,8 +14,7 @@ from madoc.report.records import EvaluationRecord, read_object, read_record
 from madoc.runs.files import read_json, replacing
 from madoc.runs.memory import read_peak
 from madoc.suites.cells import Cell
-from madoc.suites.listing import asked
-from madoc.suites.standing import Standing
+from madoc.suites.standing import Standing, asked
 
 NOT_RUN = "not run"
 
