@@ -30,9 +30,9 @@ PRINTED = {"cloning": "", "calibrating": "calibration", "exploring": "", "fittin
 ALONE = """
 import sys
 from pathlib import Path
-from madoc.suites.process import prepare
+from madoc.runs.machine import prepare_worker
 suite, name = Path(sys.argv[1]), sys.argv[2]
-prepare()
+prepare_worker()
 from madoc.suites.worker import work
 work(suite, [name])
 """

@@ -21,7 +21,7 @@ with_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="t
 
 
 def test_a_task_does_its_cell_and_no_other_and_says_when_another_process_has_it(suite, place, monkeypatch):
-    monkeypatch.setattr("madoc.suites.process.prepare", lambda: None)
+    monkeypatch.setattr("madoc.suites.on_ray.prepare_worker", lambda: None)
     monkeypatch.setattr(on_ray, "_WAIT", 0.01)
     cells = plan_of(suite(CELL + "    grid: {seed: 0..1}\n")).cells
     write_plan(place / "out", "suite", cells)

@@ -168,11 +168,11 @@ class Worker:
 
     def run(self) -> Answer:
         """Claim cells and do them."""
-        from madoc.suites.process import prepare
+        from madoc.runs.machine import prepare_worker
 
         if self.attached:
             threading.Thread(target=_stop_at_end_of_input, daemon=True).start()
-        prepare()
+        prepare_worker()
         from madoc.suites.worker import work  # computes numbers, on the core that was taken
 
         done = work(self.folder, plan=self.plan, permission=self.permission)

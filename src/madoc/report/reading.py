@@ -18,7 +18,7 @@ from madoc.errors import MadocError
 from madoc.report.records import EvaluationRecord, SpecRecord, read_object, read_record, read_spec
 from madoc.robots.document import yaml_text
 from madoc.runs.files import read_bytes
-from madoc.runs.memory import read_peak
+from madoc.runs.machine import read_peak
 
 
 @dataclass(frozen=True)

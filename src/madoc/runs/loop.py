@@ -15,7 +15,7 @@ from madoc.errors import MadocError
 from madoc.runs import checkpoint
 from madoc.runs.budget import Budget, Seconds, read_budget
 from madoc.runs.interruption import interruptible
-from madoc.runs.memory import forget_peak, peak_memory, write_peak
+from madoc.runs.machine import forget_peak, peak_memory, write_peak
 from madoc.runs.progress import Moment, display
 from madoc.runs.run_folder import RunFolder, RunLog
 from madoc.types import Epoch, Method, Metrics, Problem, State, Unit

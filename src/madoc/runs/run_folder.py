@@ -14,7 +14,7 @@ import numpy as np
 
 from madoc.errors import MadocError
 from madoc.runs.files import json_text, read_json, remove_leftovers, write_json
-from madoc.runs.versions import versions
+from madoc.runs.machine import versions
 from madoc.types import Metrics, Unit
 
 _FREE = ("budget", "versions")

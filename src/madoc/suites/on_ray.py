@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 from madoc.errors import MadocError
 from madoc.pipeline.orders import NO_PERMISSION, Permission
 from madoc.runs.interruption import interruptible
-from madoc.runs.machine import usable_cores
+from madoc.runs.machine import prepare_worker, usable_cores
 from madoc.runs.progress import display
 from madoc.suites.claims import MOST_ATTEMPTS
 from madoc.suites.standing import Standing
@@ -88,9 +88,7 @@ def do_cell(suite: str, name: str, plan: str, permission: Permission = NO_PERMIS
     Returns:
         How it ended; empty where another process still holds the cell.
     """
-    from madoc.suites.process import prepare
-
-    prepare()
+    prepare_worker()
     from madoc.suites.worker import work  # computes numbers, on the core that was taken
 
     until = time.monotonic() + _WAIT

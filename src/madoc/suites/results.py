@@ -12,7 +12,7 @@ from madoc.calibration.result import CalibrationResult, ParameterEstimate
 from madoc.errors import MadocError, printable
 from madoc.report.records import EvaluationRecord, read_object, read_record
 from madoc.runs.files import read_json, replacing
-from madoc.runs.memory import read_peak
+from madoc.runs.machine import read_peak
 from madoc.suites.cells import Cell
 from madoc.suites.standing import Standing, asked
 
