@@ -14,10 +14,9 @@ from madoc.calibration.madoc import grouping
 from madoc.calibration.madoc.actors import draw_parameters
 from madoc.calibration.madoc.state import MadocState
 from madoc.parameters import ParameterSpace
-from madoc.pipeline.calibration_stage import methods_for
+from madoc.pipeline.calibration_stage import methods_for, prepare
 from madoc.pipeline.keys import seed_key
 from madoc.pipeline.orders import CalibrationOrder
-from madoc.pipeline.preparation import prepare
 from madoc.runs import checkpoint
 from madoc.suites.cells import Cell
 from madoc.suites.planning import Plan
