@@ -15,8 +15,8 @@ from madoc.calibration.madoc.actors import draw_parameters
 from madoc.calibration.madoc.state import MadocState
 from madoc.parameters import ParameterSpace
 from madoc.pipeline.calibration_stage import methods_for, prepare
-from madoc.pipeline.keys import seed_key
 from madoc.pipeline.orders import CalibrationOrder
+from madoc.pipeline.refusals import seed_key
 from madoc.runs import checkpoint
 from madoc.suites.cells import Cell
 from madoc.suites.planning import Plan

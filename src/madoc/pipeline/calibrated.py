@@ -11,11 +11,11 @@ from madoc.errors import MadocError
 from madoc.identification.information import NORMAL_95
 from madoc.parameters import Parameter, ParameterSpace
 from madoc.pipeline.data_stage import Machine
-from madoc.pipeline.folders import ENDED
 from madoc.pipeline.orders import NO_PERMISSION, Drawing, Permission, Reading, Source
 from madoc.policies import NormalParameters
 from madoc.report.records import SpecRecord, read_spec, restored_path
 from madoc.runs.files import read_json
+from madoc.runs.run_folder import ENDED
 from madoc.tasks import Task
 
 

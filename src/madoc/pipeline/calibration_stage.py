@@ -16,14 +16,13 @@ from madoc.data import Dataset, observed_task
 from madoc.data.split import hold_out
 from madoc.diagnosis import check, refuse_fatal
 from madoc.pipeline.data_stage import Machine, fingerprint, load_source, read_truth
-from madoc.pipeline.folders import ENDED, working_folder
-from madoc.pipeline.keys import seed_key, stage_key
 from madoc.pipeline.methods import choose, hyperparameters, methods_for
 from madoc.pipeline.orders import AUTO, NO_PERMISSION, CalibrationOrder, Permission
-from madoc.pipeline.refusals import check_order, check_search, method_of
+from madoc.pipeline.refusals import check_order, check_search, method_of, seed_key, stage_key
 from madoc.report.records import DataRecord, stored_path
 from madoc.runs.budget import Budget, Seconds, read_budget
 from madoc.runs.progress import waiting
+from madoc.runs.run_folder import ENDED, working_folder
 from madoc.simulation import Simulator
 from madoc.tasks import Task
 from madoc.verdict import Bench, assess

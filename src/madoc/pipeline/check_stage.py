@@ -13,10 +13,9 @@ from madoc.diagnosis import Diagnosis, check
 from madoc.errors import MadocError
 from madoc.parameters import ParameterSpace
 from madoc.pipeline.calibration_stage import prepare
-from madoc.pipeline.keys import check_seed, stage_key
 from madoc.pipeline.methods import methods_for
 from madoc.pipeline.orders import NO_PERMISSION, CalibrationOrder, CheckOrder, Permission, SelftestOrder
-from madoc.pipeline.refusals import check_order
+from madoc.pipeline.refusals import check_order, check_seed, stage_key
 from madoc.report.words import duration
 from madoc.runs.budget import read_budget
 from madoc.verdict.predicted import sensor_noise

@@ -29,8 +29,8 @@ from madoc.numpy_policy import NumpyPolicy
 from madoc.pipeline.calibrated import Calibrated, read_calibration
 from madoc.pipeline.evaluation_stage import find_policies
 from madoc.pipeline.export_losses import losses
-from madoc.pipeline.keys import stage_key
 from madoc.pipeline.orders import NO_PERMISSION, Permission
+from madoc.pipeline.refusals import stage_key
 from madoc.report.reading import read_arrays
 from madoc.simulation import Simulator
 from madoc.simulation.configuration import (

@@ -14,11 +14,9 @@ from madoc.errors import MadocError, unknown_name
 from madoc.parameters import ParameterDistribution
 from madoc.pipeline.calibrated import Calibrated
 from madoc.pipeline.data_stage import fingerprint, load_source, read_truth
-from madoc.pipeline.folders import working_folder
-from madoc.pipeline.keys import stage_key
 from madoc.pipeline.methods import hyperparameters, make_method
 from madoc.pipeline.orders import DEFAULT_LEARNER, Place, PolicyOrder, parse_settings
-from madoc.pipeline.refusals import check_drawing, check_place, policy_budget
+from madoc.pipeline.refusals import check_drawing, check_place, policy_budget, stage_key
 from madoc.policies import (
     LEARNERS,
     LearnedPolicy,
@@ -28,6 +26,7 @@ from madoc.policies import (
     learn_policy,
     require_reward,
 )
+from madoc.runs.run_folder import working_folder
 from madoc.simulation import Simulator
 from madoc.tasks import Task
 from madoc.types import entry_of

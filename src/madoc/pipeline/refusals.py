@@ -1,14 +1,20 @@
-"""What is refused of an order before its data is read."""
+"""What is refused of an order before its data is read, and the random keys of its seed."""
 
 from pathlib import Path
 
+import jax
+from jaxtyping import PRNGKeyArray
+
 from madoc.data.split import check_share
 from madoc.errors import MadocError, unknown_name
-from madoc.pipeline.keys import check_seed
 from madoc.pipeline.orders import AUTO, CalibrationOrder, Drawing, Search
 from madoc.policies import LEARNERS
 from madoc.runs.budget import Budget, read_budget
 from madoc.tasks import Task
+from madoc.types import named_key
+
+LARGEST_SEED = 2**32 - 1
+"""Largest seed: `jax.random.key` takes 32 bits."""
 
 
 def method_of(order: CalibrationOrder) -> str:
@@ -99,3 +105,24 @@ def check_search(search: Search, task: Task, name: str) -> None:
         if named.count(parameter) > 1:
             raise MadocError(f"the parameter {parameter} is named twice; keep one")
     task.with_level(search.level)
+
+
+def check_seed(seed: int) -> None:
+    """Refuse a seed that is negative or too large."""
+    if not 0 <= seed <= LARGEST_SEED:
+        raise MadocError(f"expected a seed from 0 to {LARGEST_SEED}, got {seed}")
+
+
+def seed_key(seed: int) -> PRNGKeyArray:
+    """The random key of a seed, which calibrations use as it is: their results name the seed.
+
+    Raises:
+        MadocError: The seed is negative or too large.
+    """
+    check_seed(seed)
+    return jax.random.key(seed)
+
+
+def stage_key(seed: int, stage: str) -> PRNGKeyArray:
+    """The random key of a stage by its name, the same within `madoc run` as alone."""
+    return named_key(seed_key(seed), stage)

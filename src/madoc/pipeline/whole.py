@@ -11,7 +11,6 @@ from madoc.pipeline.calibration_stage import calibrate_in
 from madoc.pipeline.data_stage import Machine, load_source, read_truth, record_named, split_name
 from madoc.pipeline.evaluation_stage import evaluate_folder
 from madoc.pipeline.export_stage import export_run
-from madoc.pipeline.folders import ENDED, ended, holds_run, working_folder
 from madoc.pipeline.learning_stage import learn_in, require_no_goals, require_velocities
 from madoc.pipeline.methods import hyperparameters, make_method, methods_for
 from madoc.pipeline.orders import (
@@ -32,6 +31,7 @@ from madoc.policies import LEARNERS, require_reward
 from madoc.report.records import Summary, read_object, read_record
 from madoc.robots import is_spec_path
 from madoc.runs.files import read_json
+from madoc.runs.run_folder import ENDED, ended, holds_run, working_folder
 from madoc.types import entry_of
 
 

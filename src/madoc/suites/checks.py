@@ -13,7 +13,6 @@ from pathlib import Path
 from madoc import robots
 from madoc.calibration import CALIBRATORS
 from madoc.errors import MadocError, unknown_name
-from madoc.pipeline.keys import check_seed
 from madoc.pipeline.methods import candidates_for, make_method
 from madoc.pipeline.orders import (
     AUTO,
@@ -34,6 +33,7 @@ from madoc.pipeline.refusals import (
     check_order,
     check_place,
     check_search,
+    check_seed,
     method_of,
     policy_budget,
 )

@@ -13,8 +13,8 @@ from typing import Literal
 import filelock
 
 from madoc.errors import MadocError
-from madoc.pipeline.folders import ENDED
 from madoc.runs.files import read_json, remove_leftovers, write_json
+from madoc.runs.run_folder import ENDED
 from madoc.suites.cells import Cell
 
 Ending = Literal["finished", "converged", "diverged", "refused", "failed"]

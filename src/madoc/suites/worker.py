@@ -10,9 +10,9 @@ from pathlib import Path
 from madoc import data
 from madoc.errors import MadocError, NotAllowed
 from madoc.pipeline import calibrate_in, evaluate_folder, learn_in, read_calibration, record_named
-from madoc.pipeline.folders import ENDED, holds_run
 from madoc.pipeline.orders import NO_PERMISSION, CalibrationOrder, EvaluationOrder, Permission, PolicyOrder, RecordOrder
 from madoc.runs.checkpoint import OtherState
+from madoc.runs.run_folder import ENDED, holds_run
 from madoc.suites.cells import RECORDED, Cell, read_plans
 from madoc.suites.checks import forget_contents, name_of
 from madoc.suites.claims import MOST_ATTEMPTS, Claim, Outcome, attempts_of, claimed, outcome_of
