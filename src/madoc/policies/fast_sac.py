@@ -42,8 +42,7 @@ from madoc.learning.actor_critic import (
 from madoc.learning.networks import scalars, scan_inputs
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, draw_rows, require_data
-from madoc.policies.interaction import Interaction, UniformPolicy, remember, roll_on, start_acting
-from madoc.policies.judging import Judged, judge
+from madoc.policies.interaction import Interaction, Judged, UniformPolicy, judge, remember, roll_on, start_acting
 from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, Share, check_hyperparameters
 
 SMALLEST_DEVIATION = 1e-2

@@ -20,8 +20,7 @@ from madoc.learning.networks import Observations, PerRow, Scalar, adam, descend,
 from madoc.learning.sac_losses import TwinCritic
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, draw_rows, require_data
-from madoc.policies.interaction import Interaction, check_epoch, explore_or_act, start_acting
-from madoc.policies.judging import Judged, judge
+from madoc.policies.interaction import Interaction, Judged, check_epoch, explore_or_act, judge, start_acting
 from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, Share, check_hyperparameters
 
 RATIO_RANGE = (1e-5, 1.0)

@@ -33,7 +33,7 @@ from madoc.policies.imagination import (
     start_imagining,
     worst_value,
 )
-from madoc.policies.judging import Judged
+from madoc.policies.interaction import Judged
 from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, Share, check_hyperparameters
 
 

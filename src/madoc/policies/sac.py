@@ -11,10 +11,8 @@ from madoc.learning.actor_critic import ActorCritic, Batch, Descent, actor_step,
 from madoc.learning.networks import scalars, scan_inputs
 from madoc.learning.sac_losses import cloned_actor_loss, cloning_error
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
-from madoc.policies.base import PolicyProblem, draw_rows, require_data
-from madoc.policies.interaction import Interaction, check_epoch, explore_or_act, start_acting
-from madoc.policies.judging import Judged, judge
-from madoc.policies.systems import UniformParameters
+from madoc.policies.base import PolicyProblem, UniformParameters, draw_rows, require_data
+from madoc.policies.interaction import Interaction, Judged, check_epoch, explore_or_act, judge, start_acting
 from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, Share, check_hyperparameters
 
 
