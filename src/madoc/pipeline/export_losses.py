@@ -37,12 +37,8 @@ def losses(
 ) -> Losses:
     """Simulate the held-out runs anew with what is lost, all from the starts of the estimate's simulation.
 
-    Args:
-        evidence: Arrays of `verdict.evidence`, or none.
-        simulator: The robot.
-        mean: The estimate in physical units.
-        own: The values of each parameter in the robot's own model, one for each element.
-        draws: Out of the joint distribution of the estimate.
+    `evidence` has the arrays of `verdict.evidence`, or none; `mean` is the estimate in physical units; `own` has the
+    values of each parameter in the robot's own model, one for each element.
     """
     nothing = Losses([""] * len(mean))
     if "start" not in evidence:

@@ -24,13 +24,9 @@ CANDIDATES = ("least-squares", "npe")
 def make_method(
     entries: Mapping[str, MethodEntry[Made]], name: str, changes: Mapping[str, object] | None = None
 ) -> Made:
-    """A method of a registry.
+    """A method of `CALIBRATORS` or `LEARNERS`, with hyperparameters changed, those of a part of it as `agents.batch`.
 
-    Args:
-        entries: `CALIBRATORS` or `LEARNERS`.
-        name: One of its keys.
-        changes: Hyperparameters by name, those of a part of it as `agents.batch`. Text that is JSON (`3`,
-            `[256, 256]`, `null`) is read as such.
+    Text that is JSON (`3`, `[256, 256]`, `null`) is read as such.
 
     Raises:
         MadocError: No such method, no such hyperparameter, or a value of another type.

@@ -88,10 +88,7 @@ def check_drawing(drawing: Drawing, at: str, written: str) -> None:
 def check_search(search: Search, task: Task, name: str) -> None:
     """Refuse parameters that the robot does not have, one named twice, none at all, and ranges of an unknown level.
 
-    Args:
-        search: What is calibrated.
-        task: The robot.
-        name: What the order calls it, for the sentence.
+    The name is what the order calls the robot.
 
     Raises:
         MadocError: Names the parameter or the level.

@@ -85,11 +85,7 @@ def write_plan(suite: Path, name: str, cells: Iterable[Cell]) -> None:
 
 
 def read_plans(suite: Path, name: str | None = None) -> list[Cell]:
-    """The cells of the plans in a suite's folder, each once, in their order.
-
-    Args:
-        suite: The folder of the suite.
-        name: Only the cells of this plan. Default: of all.
+    """The cells of the plan of this name in a suite's folder, by default of all plans; each once, in their order.
 
     Raises:
         MadocError: There is no plan, or none of that name, or one is damaged.

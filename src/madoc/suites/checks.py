@@ -98,13 +98,7 @@ def check_policy(
     *,
     permission: Permission = NO_PERMISSION,
 ) -> None:
-    """Refuse a policy that cannot be learnt of a calibrated robot.
-
-    Args:
-        order: The policy.
-        calibration: The calibration that it needs.
-        recording: What that takes; None where it takes a log.
-        permission: What specs of robots may ask for.
+    """Refuse a policy that cannot be learnt of a calibrated robot, whose calibration takes a recording or else a log.
 
     Raises:
         Misfit: Names the key.

@@ -80,11 +80,6 @@ class Claim:
 def claimed(cell: Cell, suite: Path, *, fresh: bool = False) -> Iterator[Claim | None]:
     """A cell claimed for the block; None where another process has it, or it has ended.
 
-    Args:
-        cell: The cell.
-        suite: The folder of the suite.
-        fresh: Whether it is the first cell of this process.
-
     Raises:
         MadocError: Its folder cannot be made or locked.
     """

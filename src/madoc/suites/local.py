@@ -29,18 +29,7 @@ def run_locally(
     quiet: bool = False,
     permission: Permission = NO_PERMISSION,
 ) -> bool:
-    """Do what is left of a suite with workers of this machine.
-
-    Args:
-        suite: The folder of the suite, with its plan.
-        standing: How far it is.
-        plan: Name of the plan that has its cells.
-        workers: Number of processes.
-        quiet: Show no progress.
-        permission: What specs of robots may ask for.
-
-    Returns:
-        Whether all was done; False where it was interrupted.
+    """Do what is left of a plan with so many processes; whether all was done, False where it was interrupted.
 
     Raises:
         MadocError: No worker can be started.

@@ -47,19 +47,9 @@ def run_on_ray(
     quiet: bool = False,
     permission: Permission = NO_PERMISSION,
 ) -> bool:
-    """Do what is left of a suite on a Ray cluster.
+    """Do what is left of a plan on a Ray cluster; whether all was done, False where it was interrupted.
 
-    Args:
-        suite: The folder of the suite, with its plan.
-        standing: How far it is.
-        plan: Name of the plan that has its cells.
-        workers: How many cells are done at a time, where the cluster is started for this suite.
-        address: An existing cluster; None starts one on this machine and ends it afterwards.
-        quiet: Show no progress.
-        permission: What specs of robots may ask for.
-
-    Returns:
-        Whether all was done; False where it was interrupted.
+    Without the `address` of a cluster, one is started on this machine for so many `workers`, and ended afterwards.
 
     Raises:
         MadocError: Ray is not installed, or there is no cluster at the address.
@@ -83,11 +73,7 @@ def run_on_ray(
 
 
 def do_cell(suite: str, name: str, plan: str, permission: Permission = NO_PERMISSION) -> str:
-    """One task: do a cell of a suite, in a process of the cluster.
-
-    Returns:
-        How it ended; empty where another process still holds the cell.
-    """
+    """One task: do a cell in a process of the cluster; how it ended, empty where another process still holds it."""
     prepare_worker()
     from madoc.suites.worker import work  # computes numbers, on the core that was taken
 

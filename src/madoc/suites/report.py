@@ -52,15 +52,8 @@ def write_report(
 ) -> dict[str, Path]:
     """Leave `SUITE.html` and `SUITE.csv` in the folder of a suite, and `SUITE-fleet.json` where it has several robots.
 
-    Args:
-        plan: The suite.
-        standing: How far it is.
-        suite: Its folder.
-        command: What runs the cells that were not run.
-        parquet: Leave `SUITE.parquet` too.
-
-    Returns:
-        The files by what they are.
+    With `parquet`, leave `SUITE.parquet` too. The command is what runs the cells that were not run. Returns the files
+    by what they are.
 
     Raises:
         MadocError: The suite was never begun, a result is damaged, or a file cannot be written.

@@ -30,13 +30,8 @@ def work(
     """Carry out cells of a suite's plans until none is left that this process could begin.
 
     Any number of processes, on any number of machines that share the folder, may do this at once: each cell is done
-    by one of them. A cell that another process has is left to it, but waited for where others need its result.
-
-    Args:
-        suite: The folder of the suite.
-        names: Only these cells. Default: all.
-        plan: Only the cells of this plan. Default: of all.
-        permission: What specs of robots may ask for.
+    by one of them. A cell that another process has is left to it, but waited for where others need its result. By
+    default they are all cells of all plans.
 
     Returns:
         How the cells ended that this process did; None where it was interrupted.
@@ -103,10 +98,9 @@ def _work(
 
 
 def carry_out(claim: Claim, suite: Path, *, permission: Permission = NO_PERMISSION) -> Outcome | None:
-    """Do what a cell asks, or go on with it where an earlier process was stopped.
+    """Do what a cell asks, or go on with it where an earlier process was stopped; how it ended.
 
-    Returns:
-        How it ended; None where it was interrupted, and the next process goes on.
+    It is None where the cell was interrupted, and the next process goes on.
 
     Raises:
         NotAllowed: A spec asks for what is not allowed.
