@@ -24,7 +24,6 @@ from madoc.pipeline.orders import (
     Physics,
     PolicyOrder,
     RunOrder,
-    parse_settings,
 )
 
 if TYPE_CHECKING:
@@ -115,11 +114,9 @@ class Learn:
 
     def _place(self) -> str:
         """Where the policy was learnt, in words."""
-        from madoc.pipeline.methods import make_method
-        from madoc.policies import LEARNERS
-        from madoc.types import entry_of
+        from madoc.pipeline.methods import learner_of
 
-        entry = entry_of(make_method(LEARNERS, self.order.method, parse_settings(self.order.set)), LEARNERS)
+        _, entry = learner_of(self.order.method, self.order.set)
         if entry.needs_parameters:
             return PLACE_NAMES[self.order.at]
         return PLACE_NAMES["uniform"] if entry.unit == "control steps" else "from the data alone"

@@ -11,9 +11,10 @@ from pydantic import TypeAdapter, ValidationError
 
 from madoc.calibration import CALIBRATORS, CalibrationProblem, Calibrator
 from madoc.errors import MadocError, unknown_name
-from madoc.pipeline.orders import AUTO, CalibrationOrder
+from madoc.pipeline.orders import AUTO, CalibrationOrder, Settings, parse_settings
 from madoc.pipeline.refusals import method_of
-from madoc.types import MethodEntry
+from madoc.policies import LEARNERS, PolicyLearner
+from madoc.types import MethodEntry, entry_of
 
 Made = TypeVar("Made")
 
@@ -44,6 +45,12 @@ def make_method(
         whole, _, part = changed.partition(".")
         new[whole] = replace(new.get(whole, getattr(default, whole)), **{part: typed}) if part else typed  # type: ignore[type-var]
     return make(**new)
+
+
+def learner_of(name: str, settings: Settings) -> tuple[PolicyLearner[Any], MethodEntry[Any]]:
+    """A policy learner with its settings, and the entry of what it then is: `sac` that is told to randomize is `dr`."""
+    learner = make_method(LEARNERS, name, parse_settings(settings))
+    return learner, entry_of(learner, LEARNERS)
 
 
 def candidates_for(changes: Mapping[str, object]) -> dict[str, Calibrator[Any]]:

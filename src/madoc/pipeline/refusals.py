@@ -5,6 +5,7 @@ from pathlib import Path
 import jax
 from jaxtyping import PRNGKeyArray
 
+from madoc.data.disturbance import Disturbance
 from madoc.data.split import check_share
 from madoc.errors import MadocError, unknown_name
 from madoc.pipeline.orders import AUTO, CalibrationOrder, Drawing, Search
@@ -83,6 +84,24 @@ def check_drawing(drawing: Drawing, at: str, written: str) -> None:
     """
     if at != "distribution" and drawing != Drawing():
         raise MadocError(f"{written} and would change nothing at {at}; leave them out")
+
+
+def require_no_goals(task: Task, method: str) -> None:
+    """Raise MadocError for a learner that learns from logged data where policies observe goals, which no log has."""
+    goals = task.for_policies.goals
+    if goals and LEARNERS[method].needs_data:
+        raise MadocError(
+            f"{method} learns from logged observations, and no log has the goals of {task.name}: {', '.join(goals)}; "
+            "take a learner that needs no data"
+        )
+
+
+def require_velocities(method: str, disturbance: Disturbance, log: str) -> None:
+    """Raise MadocError for a learner that learns from logged data where the velocities of that are hidden."""
+    if disturbance.hidden_velocities and LEARNERS[method].needs_data:
+        raise MadocError(
+            f"{method} learns from whole observations, and {log} hides velocities; take a method that needs no data"
+        )
 
 
 def check_search(search: Search, task: Task, name: str) -> None:
