@@ -30,8 +30,7 @@ from madoc.pipeline.orders import (
 )
 from madoc.policies import require_reward
 from madoc.runs.files import read_json
-from madoc.suites.cells import Kind, hashed
-from madoc.suites.options import Misfit, Order, stored
+from madoc.suites.cells import Kind, Misfit, Order, hashed, stored
 from madoc.tasks import TASKS, Task
 
 

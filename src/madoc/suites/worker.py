@@ -13,10 +13,9 @@ from madoc.pipeline import calibrate_in, evaluate_folder, learn_in, read_calibra
 from madoc.pipeline.orders import NO_PERMISSION, CalibrationOrder, EvaluationOrder, Permission, PolicyOrder, RecordOrder
 from madoc.runs.checkpoint import OtherState
 from madoc.runs.run_folder import ENDED, holds_run
-from madoc.suites.cells import RECORDED, Cell, read_plans
+from madoc.suites.cells import RECORDED, Cell, Order, read_plans
 from madoc.suites.checks import forget_contents, name_of
 from madoc.suites.claims import MOST_ATTEMPTS, Claim, Outcome, attempts_of, claimed, outcome_of
-from madoc.suites.options import Order
 
 _LAST = 3
 """How often a cell is begun without getting any further before it has to wait for all others."""
