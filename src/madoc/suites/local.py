@@ -8,8 +8,7 @@ from pathlib import Path
 
 from madoc.errors import MadocError
 from madoc.pipeline.orders import NO_PERMISSION, Permission
-from madoc.runs.interruption import interruptible
-from madoc.runs.progress import display
+from madoc.runs.progress import display, interruptible
 from madoc.suites.standing import Standing
 
 _LOOK = 0.5

@@ -18,9 +18,8 @@ from typing import TYPE_CHECKING, Any
 
 from madoc.errors import MadocError
 from madoc.pipeline.orders import NO_PERMISSION, Permission
-from madoc.runs.interruption import interruptible
 from madoc.runs.machine import prepare_worker, usable_cores
-from madoc.runs.progress import display
+from madoc.runs.progress import display, interruptible
 from madoc.suites.claims import MOST_ATTEMPTS
 from madoc.suites.standing import Standing
 
