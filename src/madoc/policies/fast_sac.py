@@ -52,15 +52,7 @@ SMALLEST_DEVIATION = 1e-2
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class FastSACState:
-    """Everything the learner carries.
-
-    Attributes:
-        learner: Networks and optimisers.
-        interaction: Rows under way, the replay, and the mean and deviation of what was observed.
-        updates: Updates of the critics so far.
-        judged: The best policy so far; counts in updates.
-        key: Of all that is random from here on.
-    """
+    """The state of FastSAC; `judged` and `updates` count updates of the critics."""
 
     learner: ActorCritic
     interaction: Interaction

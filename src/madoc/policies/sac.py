@@ -19,14 +19,7 @@ from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, Share, c
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class SACState:
-    """The state of SAC.
-
-    Attributes:
-        learner: Policy, critics and their optimisers.
-        interaction: The replay, and the episodes under way in the simulator.
-        judged: The best policy so far, and when it was judged, in control steps.
-        key: The random key.
-    """
+    """The state of SAC; `judged` counts in control steps."""
 
     learner: ActorCritic
     interaction: Interaction

@@ -52,13 +52,7 @@ class Outcome:
 
 
 class Claim:
-    """A cell that this process alone works on.
-
-    Attributes:
-        cell: The cell.
-        folder: Its run folder.
-        attempts: How often it was begun without getting further, this time included.
-    """
+    """A cell that this process alone works on; `attempts` to get further were made in its folder, this one included."""
 
     def __init__(self, cell: Cell, folder: Path, *, fresh: bool) -> None:
         self.cell, self.folder, self._fresh = cell, folder, fresh
