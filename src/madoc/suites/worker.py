@@ -39,19 +39,12 @@ def work(
         NotAllowed: A spec asks for what is not allowed; the cell is left to others, and all
             that could be done without it is done.
     """
-    planned = {cell.name: cell for cell in read_plans(suite, plan)}
-    cells = list(planned.values()) if names is None else [planned[name] for name in names]
-    return _work(suite, cells, planned, permission=permission)
-
-
-def _work(
-    suite: Path, cells: Sequence[Cell], known: dict[str, Cell], *, permission: Permission
-) -> list[Outcome] | None:
-    """The loop of `work`."""
+    known = {cell.name: cell for cell in read_plans(suite, plan)}
     done: list[Outcome] = []
     not_allowed: NotAllowed | None = None
     in_vain: set[str] = set()
-    waiting, pause, patient = deque(cells), _PAUSES[0], True
+    waiting = deque(known.values() if names is None else [known[name] for name in names])
+    pause, patient = _PAUSES[0], True
     while waiting:
         later: deque[Cell] = deque()
         blocked, progressed, postponed = False, False, False
