@@ -11,9 +11,8 @@ from madoc.report.page import write_page
 from madoc.report.words import TONES
 from madoc.runs.files import write_json
 from madoc.suites.cells import Cell
-from madoc.suites.fleet import Fleet, fleets, ranges
 from madoc.suites.planning import Plan
-from madoc.suites.results import NOT_RUN, Result, results_of, rows, write_csv, write_parquet
+from madoc.suites.results import NOT_RUN, Fleet, Result, fleets, ranges, results_of, rows, write_csv, write_parquet
 from madoc.suites.standing import Standing, asked
 
 LARGEST_PAGE = 2000
