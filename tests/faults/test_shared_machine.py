@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[2]
 LISTENING = """
 import subprocess
 from pathlib import Path
-from madoc.suites.on_ray import _cluster
+from madoc.suites.executors import _cluster
 before = set(Path("/tmp").glob("madoc-ray-*"))
 with _cluster(1, None) as ray:
     ray.get(ray.remote(num_cpus=1)(lambda: 1).remote())

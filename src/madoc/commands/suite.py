@@ -85,7 +85,7 @@ class Suite:
         """Do what is left."""
         from madoc.suites.cells import write_plan
         from madoc.suites.claims import try_again
-        from madoc.suites.local import run_locally
+        from madoc.suites.executors import run_locally, run_on_ray
 
         write_plan(out, plan.name, plan.cells)
         if any([try_again(cell, out) for cell in plan.cells]):
@@ -96,8 +96,6 @@ class Suite:
             return Answer({"folder": str(out), "cells": len(plan.cells), "left": len(standing.runnable)}, lines)
         options: dict[str, Any] = {"quiet": self.output.quiet, "permission": self.permission}
         if self.executor == "ray":
-            from madoc.suites.on_ray import run_on_ray
-
             whole = run_on_ray(out, standing, plan=plan.name, workers=self.workers, address=self.address, **options)
         else:
             whole = run_locally(out, standing, plan=plan.name, workers=workers, **options)
