@@ -34,16 +34,7 @@ from madoc.pipeline.evaluation_stage import find_policies
 from madoc.pipeline.orders import NO_PERMISSION, Permission
 from madoc.pipeline.refusals import stage_key
 from madoc.report.reading import read_arrays
-from madoc.simulation import Simulator
-from madoc.simulation.configuration import (
-    JointDrive,
-    base_pose,
-    floating_beside,
-    joint_actuators,
-    joint_drives,
-    physics_options,
-    start_position,
-)
+from madoc.simulation import Simulator, configuration
 from madoc.simulation.drawn import numbers_of_draws
 from madoc.simulation.mjcf import DRIVES, save_mjcf
 from madoc.simulation.user_data import needs_callbacks
@@ -174,16 +165,16 @@ def _robot(simulator: Simulator, values: Float[np.ndarray, " parameters"], field
     """What configurations for training say of the robot at the estimate."""
     task, model = simulator.task, simulator.model(values)
     named = [channel.actuator for channel in task.actions] or element_names(model, "actuator")
-    physics, lost = physics_options(model)
+    physics, lost = configuration.physics_options(model)
     lost += [
         f"{name} floats beside the robot, and an entity has one floating base: take it out of get_spec into its own"
-        for name in floating_beside(model)
+        for name in configuration.floating_beside(model)
     ]
     return Robot(
         name=task.name,
-        actuators=joint_actuators(model, list(dict.fromkeys(named))),
-        start=start_position(model),
-        base=base_pose(model),
+        actuators=configuration.joint_actuators(model, list(dict.fromkeys(named))),
+        start=configuration.start_position(model),
+        base=configuration.base_pose(model),
         physics=physics,
         decimation=task.frame_skip,
         timestep=simulator.control_step / task.frame_skip,
@@ -193,13 +184,13 @@ def _robot(simulator: Simulator, values: Float[np.ndarray, " parameters"], field
     )
 
 
-def _drives(simulator: Simulator, values: Float[np.ndarray, " parameters"]) -> list[JointDrive]:
+def _drives(simulator: Simulator, values: Float[np.ndarray, " parameters"]) -> list[configuration.JointDrive]:
     """The d.c. drives at the estimate; what differs between runs is what it is in a log's first condition."""
     at_rest = {
         channel.actuator: channel.scale * (channel.low + 0.5 * (channel.rest + 1.0) * (channel.high - channel.low))
         for channel in simulator.task.actions
     }
-    return joint_drives(simulator.model(values), at_rest)
+    return configuration.joint_drives(simulator.model(values), at_rest)
 
 
 def _late(simulator: Simulator, values: Float[np.ndarray, " parameters"], field: str, of: str | None = None) -> float:
