@@ -28,15 +28,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from madoc.errors import MadocError
 from madoc.learning import replay
-from madoc.learning.actor_critic import (
-    ActorCritic,
-    Batch,
-    Descent,
-    actor_step,
-    fresh,
-    soft_critic_step,
-    standardising,
-)
+from madoc.learning.actor_critic import ActorCritic, Batch, Descent, actor_step, fresh, soft_critic_step, standardising
 from madoc.learning.networks import scalars, scan_inputs
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, draw_rows, require_data
