@@ -141,11 +141,10 @@ class Standing:
 
     def forecast(self) -> Forecast:
         """The time that is left."""
-        last = self._told
-        if last is None or len(self.ended) - last.seen >= max(1, last.seen // 10 if last.seen > _SETTLED else 1):
-            self._told = forecast(self.runnable, self.ended, workers=self._workers)
-        assert self._told is not None
-        return self._told
+        told = self._told
+        if told is None or len(self.ended) - told.seen >= max(1, told.seen // 10 if told.seen > _SETTLED else 1):
+            told = self._told = forecast(self.runnable, self.ended, workers=self._workers)
+        return told
 
     def moment(self) -> Moment:
         """The progress, for the bar."""
