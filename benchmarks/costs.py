@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from paper_cells import asked, chain_of, how_far, kept, planned, printed_number, wanted
+from paper_cells import chain_of, how_far, kept, planned, printed_number, wanted
 
 from madoc.report.reading import read_metrics
 from madoc.suites.cells import Cell, write_plan
@@ -30,9 +30,9 @@ PRINTED = {"cloning": "", "calibrating": "calibration", "exploring": "", "fittin
 ALONE = """
 import sys
 from pathlib import Path
-from madoc.suites.process import prepare
+from madoc.runs.machine import prepare_worker
 suite, name = Path(sys.argv[1]), sys.argv[2]
-prepare()
+prepare_worker()
 from madoc.suites.worker import work
 work(suite, [name])
 """
@@ -62,7 +62,7 @@ def cells(plan: Plan) -> list[Cell]:
     """The cells whose cost counts: policies, and the calibrations they need; `nominal` does nothing."""
     chains = [chain_of(cell, plan) for cell in wanted(plan)]
     every = [chain[kind] for chain in chains for kind in ("calibrate", "learn")]
-    return [cell for cell in every if asked(cell)["method"] != "nominal"]
+    return [cell for cell in every if cell.asks["method"] != "nominal"]
 
 
 def told(result: Result, folder: Path) -> dict:
@@ -109,7 +109,7 @@ def _by_method(plan: Plan, found: Mapping[str, Mapping]) -> dict[str, dict[str, 
     counted = {cell.name for cell in cells(plan)}
     for cell in wanted(plan):
         chain = chain_of(cell, plan)
-        calibrator, learner = asked(chain["calibrate"])["method"], asked(chain["learn"])["method"]
+        calibrator, learner = chain["calibrate"].asks["method"], chain["learn"].asks["method"]
         parts = methods.setdefault(learner if calibrator == "nominal" else calibrator, {})
         for kind in ("calibrate", "learn"):
             row = found.get(chain[kind].name, {})

@@ -7,17 +7,16 @@ from pathlib import Path
 import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
-from paper_cells import asked, how_far, kept, planned, wanted
+from paper_cells import how_far, kept, planned, wanted
 from scipy import stats
 
 from madoc.calibration.madoc import grouping
 from madoc.calibration.madoc.agents import draw_parameters
 from madoc.calibration.madoc.state import MadocState
 from madoc.parameters import ParameterSpace
-from madoc.pipeline.calibration_stage import methods_for
-from madoc.pipeline.keys import seed_key
+from madoc.pipeline.calibration_stage import methods_for, prepare
 from madoc.pipeline.orders import CalibrationOrder
-from madoc.pipeline.preparation import prepare
+from madoc.pipeline.refusals import seed_key
 from madoc.runs import checkpoint
 from madoc.suites.cells import Cell
 from madoc.suites.planning import Plan
@@ -85,7 +84,7 @@ def table(name: str) -> str:
     plan, found = planned(name), kept(name)
     by_method = defaultdict[str, dict[int, dict]](dict)
     for cell in wanted(plan):
-        by_method[asked(cell)["method"]][asked(cell).get("seed", 0)] = found.get(cell.name, {})
+        by_method[cell.asks["method"]][cell.asks.get("seed", 0)] = found.get(cell.name, {})
     seeds = sorted({seed for rows in by_method.values() for seed in rows})
     lines = [
         f"{how_far(name, wanted(plan))}.\n",

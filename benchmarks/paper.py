@@ -23,7 +23,6 @@ from paper_cells import (
     STUDIES,
     Place,
     as_asked,
-    asked,
     chain_of,
     how_far,
     in_words,
@@ -150,12 +149,12 @@ def _returned(rows: Sequence[Mapping], paper: tuple[float, float] | None) -> str
 
 def place(chain: Mapping[Kind, Cell]) -> Place:
     """Row and column of a policy: the data with what differs in it, and the system of calibrator and learner."""
-    calibration, record = asked(chain["calibrate"]), asked(chain["record"])
+    calibration, record = chain["calibrate"].asks, chain["record"].asks
     row = str(record["name"])
     row += f", {int(record['transitions']):,} rows" if "transitions" in record else ""
     row += f", {calibration['level']} ranges" if "level" in calibration else ""
     row += f", {in_words(len(calibration['parameters']))}" if calibration.get("parameters") else ""
-    method, policy = str(calibration["method"]), asked(chain["learn"])
+    method, policy = str(calibration["method"]), chain["learn"].asks
     learner, at = str(policy["method"]), str(policy.get("at", "calibrated"))
     if method != "nominal":
         return row, method if learner == "sac" else f"{method} + {learner}"

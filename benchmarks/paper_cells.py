@@ -13,8 +13,7 @@ from kept import CALIBRATIONS, RESULTS, Study, commits, is_time
 from pooling import OUR_LOGS, Rows, by_log, label, logs, order, ratio
 
 from madoc import tasks
-from madoc.suites.cells import KINDS, Cell, Kind
-from madoc.suites.options import flat
+from madoc.suites.cells import Cell, Kind
 from madoc.suites.planning import Plan, plan_of
 
 SUITES = Path(__file__).parent / "suites"
@@ -43,11 +42,6 @@ def chain_of(cell: Cell, plan: Plan) -> dict[Kind, Cell]:
         cell = by_name[cell.needs]
         chain[cell.kind] = cell
     return chain
-
-
-def asked(cell: Cell) -> dict:
-    """What a cell asks, by the keys of a suite file."""
-    return flat(KINDS[cell.kind], cell.order)
 
 
 def kept(name: str) -> dict[str, dict[str, Any]]:
@@ -164,7 +158,7 @@ def place_of(name: str, row: Mapping) -> Place:
 
 def as_asked(cells: Mapping[Kind, Cell]) -> dict:
     """What a suite asks of a calibration, in the words of `calibration.py`; its logs are of the paper's truth."""
-    told, recording = asked(cells["calibrate"]), asked(cells["record"])
+    told, recording = cells["calibrate"].asks, cells["record"].asks
     robot, _, quality = str(recording["name"]).partition("-")
     row = {"robot": robot, "quality": quality, "data": "clean", "transitions": recording.get("transitions", ROWS)}
     row |= {"method": told["method"], "log": f"suite {recording.get('seed', 0)}", "seed": told.get("seed", 0)}

@@ -17,7 +17,7 @@ import madoc.tasks
 from madoc import ENVIRONMENTS
 from madoc.errors import MadocError
 from madoc.gymnasium_environment import CalibratedEnvironment, CalibratedVectorEnvironment
-from madoc.policies.systems import NormalParameters
+from madoc.policies.base import NormalParameters
 from madoc.simulation.cpu import CpuSimulator
 from own_robots import CART_SPEC, write_robot
 

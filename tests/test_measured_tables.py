@@ -182,9 +182,7 @@ CALIBRATION = {
 
 
 def test_costs_are_those_of_a_method_by_stage(collected):
-    cells = {
-        (cell.kind, paper_cells.asked(cell)["method"]): cell for cell in costs.cells(paper_cells.planned("table-3"))
-    }
+    cells = {(cell.kind, cell.asks["method"]): cell for cell in costs.cells(paper_cells.planned("table-3"))}
     assert cells.keys() == {("calibrate", "madoc"), ("learn", "sac"), ("learn", "cql"), ("learn", "morec")}
     of_calibration = [
         ("cloning", 0, 1.0),

@@ -24,6 +24,8 @@ Count = Annotated[int, Field(ge=1)]
 """A hyperparameter that is a number of things, at least one."""
 CountOrZero = Annotated[int, Field(ge=0)]
 """A hyperparameter that is a number of things, possibly none."""
+Several = Annotated[int, Field(ge=2)]
+"""A hyperparameter that is a number of things, at least two."""
 Layers = tuple[Count, ...]
 """Number of units in each hidden layer of a network."""
 NotNegative = Annotated[float, Field(ge=0.0)]

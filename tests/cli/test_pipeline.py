@@ -12,13 +12,13 @@ from madoc.commands.main import _parse
 from madoc.data import Disturbance, disturb, observed_task
 from madoc.errors import MadocError
 from madoc.pipeline import CalibrationOrder, Reading, Search, Source, fingerprint, split_name
+from madoc.pipeline.calibration_stage import prepare
 from madoc.pipeline.data_stage import Machine
-from madoc.pipeline.folders import ended, working_folder
-from madoc.pipeline.keys import seed_key, stage_key
 from madoc.pipeline.methods import candidates_for, choose, hyperparameters, make_method
 from madoc.pipeline.orders import parse_settings
-from madoc.pipeline.preparation import prepare
+from madoc.pipeline.refusals import seed_key, stage_key
 from madoc.report.records import restored_path, stored_path
+from madoc.runs.run_folder import ended, working_folder
 from madoc.simulation import make
 from robots import SPRING_TRUTH, spring
 from robots import recorded as log_of

@@ -6,7 +6,7 @@ from types import ModuleType, SimpleNamespace
 import pytest
 
 from madoc.commands.main import main
-from madoc.commands.robot_names import model_of
+from madoc.commands.spec import model_of
 from madoc.errors import MadocError
 from robots import ARM
 

@@ -12,7 +12,7 @@ import pytest
 
 from madoc import robots, simulation
 from madoc.export.draws import save_draws
-from madoc.policies.systems import NormalParameters
+from madoc.policies.base import NormalParameters
 from madoc.simulation.mjcf import numbers_of_draws
 from own_robots import SPRING_SPEC, write_robot
 from robots import SPRING_TRUTH

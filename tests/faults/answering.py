@@ -11,7 +11,7 @@ import time
 import traceback
 
 from madoc.commands.main import main
-from madoc.runs.memory import forget_peak, peak_memory
+from madoc.runs.machine import forget_peak, peak_memory
 
 
 def answered(words):

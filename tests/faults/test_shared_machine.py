@@ -11,13 +11,12 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from madoc.runs import machine
-from madoc.suites import process
 
 ROOT = Path(__file__).parents[2]
 LISTENING = """
 import subprocess
 from pathlib import Path
-from madoc.suites.on_ray import _cluster
+from madoc.suites.executors import _cluster
 before = set(Path("/tmp").glob("madoc-ray-*"))
 with _cluster(1, None) as ray:
     ray.get(ray.remote(num_cpus=1)(lambda: 1).remote())
@@ -48,8 +47,8 @@ import numpy as np
 simulator = madoc.simulation.make(madoc.tasks.make("hopper"))
 system = simulator.bind(simulator.parameters.to_physical(np.zeros((1, len(simulator.parameters)))))
 print(system.step(simulator.initial_state[None, None], np.zeros((1, 1, 3))).shape)
-madoc.runs.memory.forget_peak()
-print(madoc.runs.memory.peak_memory())
+madoc.runs.machine.forget_peak()
+print(madoc.runs.machine.peak_memory())
 """
 
 
@@ -79,9 +78,9 @@ def test_a_folder_of_another_user_is_not_taken_for_ones_own(cache, monkeypatch):
     (cache.parent / "temporary" / "madoc-4321").mkdir()
     monkeypatch.setattr(machine, "_user", lambda: 4321)
     assert machine.own_folder("cores") is None
-    monkeypatch.setattr(process, "_held", [])
-    process.take_core()  # none is taken, and nothing is blocked
-    assert process._held == []
+    monkeypatch.setattr(machine, "_held", [])
+    machine.take_core()  # none is taken, and nothing is blocked
+    assert machine._held == []
 
 
 def test_a_link_is_no_folder_of_ones_own(cache):
@@ -92,8 +91,8 @@ def test_a_link_is_no_folder_of_ones_own(cache):
 
 def test_compiled_code_lies_in_no_folder_of_a_suite(cache, monkeypatch):
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
-    monkeypatch.setattr(process, "take_core", lambda: None)
-    process.prepare()
+    monkeypatch.setattr(machine, "take_core", lambda: None)
+    machine.prepare_worker()
     compiled = Path(os.environ.pop("JAX_COMPILATION_CACHE_DIR"))
     assert compiled.is_relative_to(cache)
     assert mode(compiled) == 0o700
@@ -103,10 +102,9 @@ def test_a_system_without_affinity_has_cores_too_and_none_is_taken(cache, monkey
     for name in LINUX_ALONE:
         monkeypatch.delattr(os, name, raising=False)
     assert machine.usable_cores() == os.cpu_count()
-    monkeypatch.setattr(process, "_held", [])
-    process.take_core()
-    assert process._held == []
-    machine.keep_to_core(0)
+    monkeypatch.setattr(machine, "_held", [])
+    machine.take_core()
+    assert machine._held == []
 
 
 def test_every_module_is_imported_and_a_robot_steps_where_linux_is_not():

@@ -9,7 +9,7 @@ import numpy as np
 
 from madoc.report import write_report
 from madoc.report.reading import Evidence
-from madoc.report.sections.robustness import farthest_apart, read_film
+from madoc.report.sections.outcome import farthest_apart, read_film
 
 
 def test_a_film_is_read_with_a_sheet_for_each_panel(whole):

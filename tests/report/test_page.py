@@ -15,7 +15,7 @@ from madoc.report.page import headline, run_context
 from madoc.report.reading import read_run
 from madoc.report.sections import SECTIONS
 from madoc.report.words import TO_DO, TONES
-from madoc.runs.memory import write_peak
+from madoc.runs.machine import write_peak
 
 IDS = list(SECTIONS)
 

@@ -4,8 +4,7 @@ import pytest
 
 from madoc.pipeline.orders import CalibrationOrder, EvaluationOrder, PolicyOrder, RecordOrder
 from madoc.suites import checks
-from madoc.suites.cells import read_plans, write_plan
-from madoc.suites.options import keys_of
+from madoc.suites.cells import keys_of, read_plans, write_plan
 from madoc.suites.planning import plan_of
 from robots import CELL
 

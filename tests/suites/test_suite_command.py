@@ -70,7 +70,7 @@ def test_the_command_for_the_report_may_run_code_where_the_suite_may(suite, plac
 
 
 def test_a_worker_needs_a_plan(place, capsys, monkeypatch):
-    monkeypatch.setattr("madoc.suites.process.take_core", lambda: None)
+    monkeypatch.setattr("madoc.runs.machine.take_core", lambda: None)
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(place))
     assert main(["worker", str(place)]) == 2
     assert "there is no plan of a suite" in capsys.readouterr().err

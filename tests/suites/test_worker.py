@@ -8,8 +8,9 @@ import pytest
 
 from madoc.errors import MadocError, NotAllowed
 from madoc.pipeline.orders import Permission
+from madoc.runs import machine
 from madoc.runs.checkpoint import OtherState
-from madoc.suites import process, worker
+from madoc.suites import worker
 from madoc.suites.cells import Cell, write_plan
 from madoc.suites.claims import MOST_ATTEMPTS, attempts_of, claimed, outcome_of, try_again
 from madoc.suites.planning import plan_of
@@ -62,14 +63,14 @@ def test_a_refusal_is_kept_with_its_sentence_and_others_go_on(planned):
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system knows no affinity")
 def test_a_user_without_a_name_takes_a_core(tmp_path, monkeypatch):
     taken = []
-    monkeypatch.setattr(process, "_held", [])
+    monkeypatch.setattr(machine, "_held", [])
     monkeypatch.setattr("tempfile.gettempdir", lambda: str(tmp_path))
     monkeypatch.setattr("pwd.getpwuid", {}.__getitem__)
     for name in ("LOGNAME", "USER", "LNAME", "USERNAME"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {2, 3})
     monkeypatch.setattr(os, "sched_setaffinity", lambda pid, cores: taken.append(cores))
-    process.take_core()
+    machine.take_core()
     assert taken == [{2}]
 
 

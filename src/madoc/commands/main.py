@@ -20,7 +20,6 @@ from madoc.commands.stages import Calibrate, Evaluate, Learn, Run
 from madoc.commands.suite import Suite, Worker
 from madoc.errors import MadocError, printable
 from madoc.runs.files import json_text
-from madoc.runs.versions import versions
 
 WIDTH = 110
 """Width of a table in characters where standard output is no terminal."""
@@ -52,6 +51,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     code = 0
     words = sys.argv[1:] if arguments is None else list(arguments)
     if words == ["--version"]:
+        from madoc.runs.machine import versions
+
         others = {name: version for name, version in versions().items() if name != "madoc"}
         print(f"madoc {__version__} ({', '.join(f'{name} {version}' for name, version in others.items())})")
         return code

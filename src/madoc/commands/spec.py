@@ -1,5 +1,7 @@
-"""`madoc init` and `madoc spec`, for a user's own robot."""
+"""`madoc init` and `madoc spec`, for a user's own robot, and models of robots by name."""
 
+import importlib
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -9,11 +11,16 @@ from rich.table import Table
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from madoc.commands.answer import Answer, Output
-from madoc.errors import MadocError, listed
+from madoc.errors import MadocError, listed, nearest
 from madoc.pipeline.orders import Permission
 
 if TYPE_CHECKING:
     from madoc.robots import Robot
+
+_CACHE = "~/.cache/robot_descriptions"
+"""Where robot_descriptions keeps what it has fetched, unless ROBOT_DESCRIPTIONS_CACHE names another folder."""
+_OTHERS = ("scene", "mjx")
+"""Parts of names of files that are a robot's surroundings, or variants of it."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +45,6 @@ class Init:
     def run(self) -> Answer:
         """Write the file."""
         from madoc import robots
-        from madoc.commands.robot_names import model_of
         from madoc.robots.init import write_spec
 
         model = model_of(self.model, menagerie=self.menagerie, download=self.download)
@@ -163,3 +169,55 @@ def _table(title: str, headings: tuple[str, ...]) -> Table:
     for heading in headings:
         table.add_column(heading, justify="right" if heading in ("low", "high", "model") else "left")
     return table
+
+
+def model_of(name: str, *, menagerie: Path | None = None, download: bool = False) -> Path:
+    """The model file of a robot: `name` itself where it is a path, else of the robot of that name.
+
+    It is looked for in a checkout of MuJoCo Menagerie, which is `menagerie` or the one that robot_descriptions has
+    fetched before. The network is used only where `download` says so.
+
+    Raises:
+        MadocError: There is no such robot, or more than one.
+    """
+    path = Path(name).expanduser()
+    if path.exists() or path.suffix or len(path.parts) != 1:
+        return path
+    if menagerie is not None and not menagerie.expanduser().is_dir():
+        raise MadocError(f"there is no folder {menagerie}; name a checkout of MuJoCo Menagerie with --menagerie")
+    cache = Path(os.environ.get("ROBOT_DESCRIPTIONS_CACHE", _CACHE)) / "mujoco_menagerie"
+    models = sorted((menagerie or cache).expanduser().glob("*/*.xml"))
+    found = [file for file in models if file.stem == name]
+    if not found:
+        of_robot = [file for file in models if file.parent.name == name]
+        found = [file for file in of_robot if not any(word in file.stem for word in _OTHERS)]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise MadocError(f"{name} may be {listed([str(file) for file in found], 8)}; name the file of one of them")
+    if download:
+        return _fetched(name)
+    known = nearest(name, [file.stem for file in models if not file.stem.startswith(_OTHERS)])
+    where = f"; near it are {', '.join(known)}" if known else ""
+    raise MadocError(
+        f"there is no file {name}, and no robot of that name in {menagerie or cache}{where}; name a model file, a "
+        "checkout of MuJoCo Menagerie with --menagerie, or let the package robot_descriptions fetch it with --download"
+    )
+
+
+def _fetched(name: str) -> Path:
+    """The model that robot_descriptions fetches by git, MJCF before URDF."""
+    try:
+        known = importlib.import_module("robot_descriptions._descriptions").DESCRIPTIONS
+    except ImportError:
+        needed = 'pip install "madoc-calibration[robots]"'
+        raise MadocError(f"fetching a robot needs the package robot_descriptions; {needed}") from None
+    for kind, path in (("mj_description", "MJCF_PATH"), ("description", "URDF_PATH")):
+        if f"{name}_{kind}" in known:
+            try:
+                return Path(getattr(importlib.import_module(f"robot_descriptions.{name}_{kind}"), path))
+            except Exception as error:  # git raises what it likes where there is no network
+                reason = " ".join(str(error).split())[:200]
+                raise MadocError(f"could not fetch {name} ({reason}); is there a network, and git?") from error
+    names = [key.removesuffix("_description").removesuffix("_mj") for key in known]
+    raise MadocError(f"robot_descriptions has no robot {name}; near it are {', '.join(nearest(name, names)) or 'none'}")

@@ -85,7 +85,7 @@ class Suite:
         """Do what is left."""
         from madoc.suites.cells import write_plan
         from madoc.suites.claims import try_again
-        from madoc.suites.local import run_locally
+        from madoc.suites.executors import run_locally, run_on_ray
 
         write_plan(out, plan.name, plan.cells)
         if any([try_again(cell, out) for cell in plan.cells]):
@@ -96,8 +96,6 @@ class Suite:
             return Answer({"folder": str(out), "cells": len(plan.cells), "left": len(standing.runnable)}, lines)
         options: dict[str, Any] = {"quiet": self.output.quiet, "permission": self.permission}
         if self.executor == "ray":
-            from madoc.suites.on_ray import run_on_ray
-
             whole = run_on_ray(out, standing, plan=plan.name, workers=self.workers, address=self.address, **options)
         else:
             whole = run_locally(out, standing, plan=plan.name, workers=workers, **options)
@@ -117,7 +115,7 @@ class Suite:
 
 def _listed(standing: "Standing", out: Path, workers: int) -> Answer:
     """The cells, a line each, and the forecast."""
-    from madoc.suites.listing import lines, rows
+    from madoc.suites.standing import lines, rows
 
     told = standing.forecast()
     listed = rows(standing)
@@ -168,11 +166,11 @@ class Worker:
 
     def run(self) -> Answer:
         """Claim cells and do them."""
-        from madoc.suites.process import prepare
+        from madoc.runs.machine import prepare_worker
 
         if self.attached:
             threading.Thread(target=_stop_at_end_of_input, daemon=True).start()
-        prepare()
+        prepare_worker()
         from madoc.suites.worker import work  # computes numbers, on the core that was taken
 
         done = work(self.folder, plan=self.plan, permission=self.permission)

@@ -66,8 +66,7 @@ def cloning_epoch(
 ) -> tuple[Clone, PRNGKeyArray, Epoch]:
     """`continue_cloning` as an epoch of a method that clones for so many `epochs` before it calibrates.
 
-    Returns:
-        The clone, the key of what follows, and what the epoch did.
+    Also the key of what follows, and what the epoch did.
     """
     of_batches, key = jax.random.split(key)
     clone, metrics = continue_cloning(

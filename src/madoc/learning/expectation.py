@@ -93,8 +93,7 @@ def learn_expectation(
 ) -> tuple[Expectation, Scalar]:
     """One of `epochs` epochs of `updates` updates on logged rows, of which the last measures what is left of them.
 
-    Returns:
-        The regression, and the mean loss.
+    Also returns the mean loss.
     """
     network, optimiser, loss = _train(
         expectation.network,
@@ -136,11 +135,8 @@ def noise_of_log(
     is linear in the variances, which are solved for by least squares without negative ones. Errors of the regression
     have the same sign in consecutive windows; they make the estimate smaller.
 
-    Args:
-        dataset: The log. Of rows without an order, or whose next observations are shuffled, no noise is told.
-        features: Its features.
-        length: Rows of a window.
-        expectation: A regression that has been trained on these windows; None trains one.
+    Of rows without an order, or whose next observations are shuffled, no noise is told. `length` is in rows. Without an
+    expectation that has been trained on these windows, one is trained.
     """
     nothing = np.zeros(dataset.transitions.observation.shape[-1])
     last = last_rows(dataset, length)[:SLOPE_ROWS]
@@ -166,9 +162,7 @@ def derivatives_by_readings(
 ) -> Float[np.ndarray, "lags rows out observation"]:
     """H_k of `noise_of_log`: derivatives of residuals by the reading of k rows before s', for k from 0 to length + 1.
 
-    Args:
-        scaling: How windows are described; see `WindowScaling`.
-        slopes: Derivatives of what is expected by the features of each window.
+    `slopes` are derivatives of what is expected by the features of each window.
     """
     channels, row, pairs = len(scaling.next_scale), scaling.scaling, len(scaling.scaling.pair_scale)
     by_reading = np.zeros((scaling.length + 2, len(slopes), channels, channels))

@@ -26,13 +26,9 @@ HIDDEN_WINDOW = 3
 
 @dataclass(frozen=True)
 class Scaling:
-    """Offsets and scales of (s, a, s'); features are computed in float64 and returned in float32.
+    """Offset and scale of (s, a), and scale of the description of s': by s' - s with `difference`, else by s' itself.
 
-    Attributes:
-        pair_offset: Offset of (s, a).
-        pair_scale: Scale of (s, a).
-        next_scale: Scale of the description of s'.
-        difference: Whether s' is described by s' - s, or else by s' itself.
+    Features are computed in float64 and returned in float32.
     """
 
     pair_offset: Float[np.ndarray, " pair"]
@@ -107,12 +103,7 @@ class WindowScaling:
 
     Of a longer window, the last row is described by (s, a) and the earlier rows by (s' - s, a), the latest first:
     positions of neighbouring rows would hardly differ. The observation after the window is described by the change of
-    motion, (s' - s) - (s - s₋₁).
-
-    Attributes:
-        scaling: Scaling of one row.
-        length: Rows of a window.
-        next_scale: Scale of the description of the observation after the window.
+    motion, (s' - s) - (s - s₋₁), whose scale is `next_scale`.
     """
 
     scaling: Scaling

@@ -11,11 +11,11 @@ from madoc.errors import MadocError
 from madoc.identification.information import NORMAL_95
 from madoc.parameters import Parameter, ParameterSpace
 from madoc.pipeline.data_stage import Machine
-from madoc.pipeline.folders import ENDED
 from madoc.pipeline.orders import NO_PERMISSION, Drawing, Permission, Reading, Source
 from madoc.policies import NormalParameters
 from madoc.report.records import SpecRecord, read_spec, restored_path
 from madoc.runs.files import read_json
+from madoc.runs.run_folder import ENDED
 from madoc.tasks import Task
 
 
@@ -74,10 +74,8 @@ def read_calibration(
 ) -> Calibrated:
     """A finished calibration: a run folder of `madoc calibrate` or `madoc run`, or a `result.json` alone.
 
-    Args:
-        path: The folder or file.
-        physics: Physics of the simulator, for a result outside its run folder; None is `legacy`.
-        permission: Whether the Python file of the robot's spec may be run, if it has one; else such a run is refused.
+    The physics are those of a result outside its run folder, by default `legacy`. A run whose spec names a Python file
+    is refused unless there is permission to run it.
 
     Raises:
         MadocError: There is no calibration, it has not ended, or it is of other physics.

@@ -12,8 +12,8 @@ from madoc import data, robots, simulation, tasks
 from madoc.data import Dataset, logs
 from madoc.data.native import recognises as is_recorded
 from madoc.errors import MadocError, unknown_name
-from madoc.pipeline.keys import stage_key
 from madoc.pipeline.orders import NO_PERMISSION, Permission, RecordOrder, Source
+from madoc.pipeline.refusals import stage_key
 from madoc.policies.behaviours import QUALITIES, record_quality
 from madoc.report.records import SpecRecord
 from madoc.robots import Robot

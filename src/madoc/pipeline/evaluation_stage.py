@@ -12,9 +12,8 @@ from madoc.evaluation import evaluate
 from madoc.pipeline.calibrated import Calibrated, read_calibration
 from madoc.pipeline.data_stage import Machine, read_truth
 from madoc.pipeline.film_stage import leave_film
-from madoc.pipeline.keys import stage_key
 from madoc.pipeline.orders import NO_PERMISSION, EvaluationOrder, Permission
-from madoc.pipeline.refusals import check_counts
+from madoc.pipeline.refusals import check_counts, stage_key
 from madoc.policies import ErrorCost, OverDraws, costs_of_errors, load_policy, over_draws
 from madoc.report.records import EvaluationRecord, SpecRecord, read_spec
 from madoc.runs.files import write_json

@@ -1,7 +1,10 @@
-"""Export as a stage: a finished calibration as files for other tools."""
+"""Export as a stage: a finished calibration as files for other tools, and what an export loses there.
 
-from collections.abc import Iterable, Sequence
-from dataclasses import asdict, replace
+Losses are errors over held-out runs with a parameter left out, rounded, or drawn by itself.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,26 +28,19 @@ from madoc.export.trainers import Robot, save_isaac_lab, save_mjlab
 from madoc.numpy_policy import NumpyPolicy
 from madoc.pipeline.calibrated import Calibrated, read_calibration
 from madoc.pipeline.evaluation_stage import find_policies
-from madoc.pipeline.export_losses import losses
-from madoc.pipeline.keys import stage_key
 from madoc.pipeline.orders import NO_PERMISSION, Permission
+from madoc.pipeline.refusals import stage_key
 from madoc.report.reading import read_arrays
-from madoc.simulation import Simulator
-from madoc.simulation.configuration import (
-    JointDrive,
-    base_pose,
-    floating_beside,
-    joint_actuators,
-    joint_drives,
-    physics_options,
-    start_position,
-)
+from madoc.simulation import Simulator, configuration
 from madoc.simulation.joints import needs_callbacks
 from madoc.simulation.mjcf import DRIVES, numbers_of_draws, save_mjcf
 from madoc.simulation.write import element_names, nominal_values
+from madoc.verdict.evidence import replay_errors
 
 DRAWS = 1000
 """Number of models drawn from the distribution of an estimate; their covariance is within 5 % of its own."""
+COMPARED = 20
+"""Number of draws whose errors are compared with those of as many drawn parameter by parameter."""
 
 
 def export_run(
@@ -165,16 +161,16 @@ def _robot(simulator: Simulator, values: Float[np.ndarray, " parameters"], field
     """What configurations for training say of the robot at the estimate."""
     task, model = simulator.task, simulator.model(values)
     named = [channel.actuator for channel in task.actions] or element_names(model, "actuator")
-    physics, lost = physics_options(model)
+    physics, lost = configuration.physics_options(model)
     lost += [
         f"{name} floats beside the robot, and an entity has one floating base: take it out of get_spec into its own"
-        for name in floating_beside(model)
+        for name in configuration.floating_beside(model)
     ]
     return Robot(
         name=task.name,
-        actuators=joint_actuators(model, list(dict.fromkeys(named))),
-        start=start_position(model),
-        base=base_pose(model),
+        actuators=configuration.joint_actuators(model, list(dict.fromkeys(named))),
+        start=configuration.start_position(model),
+        base=configuration.base_pose(model),
         physics=physics,
         decimation=task.frame_skip,
         timestep=simulator.control_step / task.frame_skip,
@@ -184,13 +180,13 @@ def _robot(simulator: Simulator, values: Float[np.ndarray, " parameters"], field
     )
 
 
-def _drives(simulator: Simulator, values: Float[np.ndarray, " parameters"]) -> list[JointDrive]:
+def _drives(simulator: Simulator, values: Float[np.ndarray, " parameters"]) -> list[configuration.JointDrive]:
     """The d.c. drives at the estimate; what differs between runs is what it is in a log's first condition."""
     at_rest = {
         channel.actuator: channel.scale * (channel.low + 0.5 * (channel.rest + 1.0) * (channel.high - channel.low))
         for channel in simulator.task.actions
     }
-    return joint_drives(simulator.model(values), at_rest)
+    return configuration.joint_drives(simulator.model(values), at_rest)
 
 
 def _late(simulator: Simulator, values: Float[np.ndarray, " parameters"], field: str, of: str | None = None) -> float:
@@ -240,3 +236,57 @@ def _stepping(simulator: Simulator) -> dict[str, object]:
         "timestep_s": simulator.control_step / steps,
         "controls": f"values of the channels, {held}" if channels else f"actions in [-1, 1], {held}",
     } | ({"channels": channels} if channels else {})
+
+
+@dataclass(frozen=True)
+class Losses:
+    """Clauses with the size of what is lost; each is empty where the run folder does not tell.
+
+    Attributes:
+        left_out: Of each parameter, where it stays what the robot's own model has: outside it, nothing.
+        rounded: Where the delay is a whole number of physics steps.
+        independent: Where parameters are drawn each by itself, beside whole rows of draws.
+    """
+
+    left_out: Sequence[str]
+    rounded: str = ""
+    independent: str = ""
+
+
+def losses(
+    evidence: Mapping[str, np.ndarray],
+    simulator: Simulator,
+    mean: Float[np.ndarray, " d"],
+    own: Sequence[tuple[float, ...]],
+    draws: Float[np.ndarray, "draws d"],
+) -> Losses:
+    """Simulate the held-out runs anew with what is lost, all from the starts of the estimate's simulation.
+
+    `evidence` has the arrays of `verdict.evidence`, or none; `mean` is the estimate in physical units; `own` has the
+    values of each parameter in the robot's own model, one for each element.
+    """
+    nothing = Losses([""] * len(mean))
+    if "start" not in evidence:
+        return nothing
+    step = simulator.control_step / simulator.task.frame_skip
+    delays = [row.field == "action_delay" and not row.elements for row in simulator.parameters.parameters]
+    alone = np.where(np.eye(len(mean), dtype=bool), [np.mean(values) for values in own], mean)
+    whole = np.where(delays, np.round(mean / step) * step, mean)
+    some = draws[:COMPARED]
+    apart = np.random.default_rng(0).permuted(some, axis=0)  # the same values of each parameter, in another order
+    found = replay_errors(evidence, simulator, np.concatenate([mean[None], alone, whole[None], some, apart]))
+    if found is None or not 0.0 < found[0] < np.inf:
+        return nothing
+    ratio = found / found[0]
+    joint, single = (np.sqrt(np.mean(part**2)) for part in np.split(found[-2 * len(some) :], 2))
+    same = [len(set(values)) == 1 for values in own]
+    return Losses(
+        [_clause("left out", each) if known else "" for each, known in zip(ratio[1:], same, strict=False)],
+        rounded=_clause("so", ratio[1 + len(mean)]) if any(delays) else "",
+        independent=f"{single / joint:.3g} times the error of whole rows over held-out runs" if joint < np.inf else "",
+    )
+
+
+def _clause(how: str, ratio: float) -> str:
+    told = f"is {ratio:.3g} times as large" if ratio < np.inf else "has no bound, as simulations fail"
+    return f"; {how}, the error over held-out runs {told}"

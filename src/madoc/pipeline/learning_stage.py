@@ -9,16 +9,13 @@ import numpy as np
 
 from madoc import simulation
 from madoc.data import Dataset
-from madoc.data.disturbance import Disturbance
 from madoc.errors import MadocError, unknown_name
 from madoc.parameters import ParameterDistribution
+from madoc.pipeline import refusals
 from madoc.pipeline.calibrated import Calibrated
 from madoc.pipeline.data_stage import fingerprint, load_source, read_truth
-from madoc.pipeline.folders import working_folder
-from madoc.pipeline.keys import stage_key
-from madoc.pipeline.methods import hyperparameters, make_method
-from madoc.pipeline.orders import DEFAULT_LEARNER, Place, PolicyOrder, parse_settings
-from madoc.pipeline.refusals import check_drawing, check_place, policy_budget
+from madoc.pipeline.methods import hyperparameters, learner_of
+from madoc.pipeline.orders import DEFAULT_LEARNER, Place, PolicyOrder
 from madoc.policies import (
     LEARNERS,
     LearnedPolicy,
@@ -28,9 +25,8 @@ from madoc.policies import (
     learn_policy,
     require_reward,
 )
+from madoc.runs.run_folder import working_folder
 from madoc.simulation import Simulator
-from madoc.tasks import Task
-from madoc.types import entry_of
 
 PLACES: tuple[str, ...] = get_args(Place)
 """Where a policy may be learnt, as `PolicyOrder.at` explains."""
@@ -46,13 +42,12 @@ def learn_in(
     Raises:
         MadocError: The order cannot be carried out; a new folder is then not left behind.
     """
-    method = make_method(LEARNERS, order.method, parse_settings(order.set))
-    entry = entry_of(method, LEARNERS)
-    budget = policy_budget(entry.name, order.budget)
-    check_place(entry.name, order.at, f"--at {order.at}")
+    method, entry = learner_of(order.method, order.set)
+    budget = refusals.policy_budget(entry.name, order.budget)
+    refusals.check_place(entry.name, order.at, f"--at {order.at}")
     require_reward(calibrated.task)
-    require_no_goals(calibrated.task, entry.name)
-    key = stage_key(order.seed, "learning")
+    refusals.require_no_goals(calibrated.task, entry.name)
+    key = refusals.stage_key(order.seed, "learning")
     truth = read_truth(order.truth) or calibrated.spec.truth
     simulator, parameters = _system(calibrated, order, truth)
     dataset = _logged(calibrated, entry.name) if entry.needs_data else None
@@ -83,24 +78,6 @@ def policy_folder_name(at: str, method: str) -> str:
     return f"policy-{at}" if method == DEFAULT_LEARNER else f"policy-{at}-{method}"
 
 
-def require_no_goals(task: Task, method: str) -> None:
-    """Raise MadocError for a learner that learns from logged data where policies observe goals, which no log has."""
-    goals = task.for_policies.goals
-    if goals and LEARNERS[method].needs_data:
-        raise MadocError(
-            f"{method} learns from logged observations, and no log has the goals of {task.name}: {', '.join(goals)}; "
-            "take a learner that needs no data"
-        )
-
-
-def require_velocities(method: str, disturbance: Disturbance, log: str) -> None:
-    """Raise MadocError for a learner that learns from logged data where the velocities of that are hidden."""
-    if disturbance.hidden_velocities and LEARNERS[method].needs_data:
-        raise MadocError(
-            f"{method} learns from whole observations, and {log} hides velocities; take a method that needs no data"
-        )
-
-
 def _logged(calibrated: Calibrated, method: str) -> Dataset:
     """The data of a calibration, for a learner that learns from it."""
     if calibrated.source is None:
@@ -109,7 +86,7 @@ def _logged(calibrated: Calibrated, method: str) -> Dataset:
             "give it the run folder of the calibration"
         )
     dataset = load_source(calibrated.source, calibrated.machine, seed=calibrated.result.seed)
-    require_velocities(method, dataset.disturbance, dataset.origin)
+    refusals.require_velocities(method, dataset.disturbance, dataset.origin)
     recorded = "" if calibrated.spec.data is None else calibrated.spec.data.fingerprint
     if recorded and fingerprint(dataset) != recorded:
         raise MadocError(
@@ -126,7 +103,7 @@ def _system(
     at = order.at
     if at not in PLACES:
         raise unknown_name("place to learn at", at, PLACES)
-    check_drawing(order.drawing, at, "--share and --width are of --at distribution")
+    refusals.check_drawing(order.drawing, at, "--share and --width are of --at distribution")
     if truth is not None:
         calibrated.machine.check_truth(truth, calibrated.task)
     if at == "truth":

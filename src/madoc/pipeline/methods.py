@@ -11,9 +11,10 @@ from pydantic import TypeAdapter, ValidationError
 
 from madoc.calibration import CALIBRATORS, CalibrationProblem, Calibrator
 from madoc.errors import MadocError, unknown_name
-from madoc.pipeline.orders import AUTO, CalibrationOrder
+from madoc.pipeline.orders import AUTO, CalibrationOrder, Settings, parse_settings
 from madoc.pipeline.refusals import method_of
-from madoc.types import MethodEntry
+from madoc.policies import LEARNERS, PolicyLearner
+from madoc.types import MethodEntry, entry_of
 
 Made = TypeVar("Made")
 
@@ -24,13 +25,9 @@ CANDIDATES = ("least-squares", "npe")
 def make_method(
     entries: Mapping[str, MethodEntry[Made]], name: str, changes: Mapping[str, object] | None = None
 ) -> Made:
-    """A method of a registry.
+    """A method of `CALIBRATORS` or `LEARNERS`, with hyperparameters changed, those of a part of it as `agents.batch`.
 
-    Args:
-        entries: `CALIBRATORS` or `LEARNERS`.
-        name: One of its keys.
-        changes: Hyperparameters by name, those of a part of it as `agents.batch`. Text that is JSON (`3`,
-            `[256, 256]`, `null`) is read as such.
+    Text that is JSON (`3`, `[256, 256]`, `null`) is read as such.
 
     Raises:
         MadocError: No such method, no such hyperparameter, or a value of another type.
@@ -48,6 +45,12 @@ def make_method(
         whole, _, part = changed.partition(".")
         new[whole] = replace(new.get(whole, getattr(default, whole)), **{part: typed}) if part else typed  # type: ignore[type-var]
     return make(**new)
+
+
+def learner_of(name: str, settings: Settings) -> tuple[PolicyLearner[Any], MethodEntry[Any]]:
+    """A policy learner with its settings, and the entry of what it then is: `sac` that is told to randomize is `dr`."""
+    learner = make_method(LEARNERS, name, parse_settings(settings))
+    return learner, entry_of(learner, LEARNERS)
 
 
 def candidates_for(changes: Mapping[str, object]) -> dict[str, Calibrator[Any]]:

@@ -1,14 +1,21 @@
-"""What is refused of an order before its data is read."""
+"""What is refused of an order before its data is read, and the random keys of its seed."""
 
 from pathlib import Path
 
+import jax
+from jaxtyping import PRNGKeyArray
+
 from madoc.data.dataset import check_share
+from madoc.data.disturbance import Disturbance
 from madoc.errors import MadocError, unknown_name
-from madoc.pipeline.keys import check_seed
 from madoc.pipeline.orders import AUTO, CalibrationOrder, Drawing, Search
 from madoc.policies import LEARNERS
 from madoc.runs.budget import Budget, read_budget
 from madoc.tasks import Task
+from madoc.types import named_key
+
+LARGEST_SEED = 2**32 - 1
+"""Largest seed: `jax.random.key` takes 32 bits."""
 
 
 def method_of(order: CalibrationOrder) -> str:
@@ -79,13 +86,28 @@ def check_drawing(drawing: Drawing, at: str, written: str) -> None:
         raise MadocError(f"{written} and would change nothing at {at}; leave them out")
 
 
+def require_no_goals(task: Task, method: str) -> None:
+    """Raise MadocError for a learner that learns from logged data where policies observe goals, which no log has."""
+    goals = task.for_policies.goals
+    if goals and LEARNERS[method].needs_data:
+        raise MadocError(
+            f"{method} learns from logged observations, and no log has the goals of {task.name}: {', '.join(goals)}; "
+            "take a learner that needs no data"
+        )
+
+
+def require_velocities(method: str, disturbance: Disturbance, log: str) -> None:
+    """Raise MadocError for a learner that learns from logged data where the velocities of that are hidden."""
+    if disturbance.hidden_velocities and LEARNERS[method].needs_data:
+        raise MadocError(
+            f"{method} learns from whole observations, and {log} hides velocities; take a method that needs no data"
+        )
+
+
 def check_search(search: Search, task: Task, name: str) -> None:
     """Refuse parameters that the robot does not have, one named twice, none at all, and ranges of an unknown level.
 
-    Args:
-        search: What is calibrated.
-        task: The robot.
-        name: What the order calls it, for the sentence.
+    The name is what the order calls the robot.
 
     Raises:
         MadocError: Names the parameter or the level.
@@ -99,3 +121,24 @@ def check_search(search: Search, task: Task, name: str) -> None:
         if named.count(parameter) > 1:
             raise MadocError(f"the parameter {parameter} is named twice; keep one")
     task.with_level(search.level)
+
+
+def check_seed(seed: int) -> None:
+    """Refuse a seed that is negative or too large."""
+    if not 0 <= seed <= LARGEST_SEED:
+        raise MadocError(f"expected a seed from 0 to {LARGEST_SEED}, got {seed}")
+
+
+def seed_key(seed: int) -> PRNGKeyArray:
+    """The random key of a seed, which calibrations use as it is: their results name the seed.
+
+    Raises:
+        MadocError: The seed is negative or too large.
+    """
+    check_seed(seed)
+    return jax.random.key(seed)
+
+
+def stage_key(seed: int, stage: str) -> PRNGKeyArray:
+    """The random key of a stage by its name, the same within `madoc run` as alone."""
+    return named_key(seed_key(seed), stage)

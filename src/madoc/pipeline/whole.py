@@ -6,14 +6,14 @@ from pathlib import Path
 from madoc import data
 from madoc.calibration import CalibrationResult
 from madoc.errors import MadocError
+from madoc.pipeline import refusals
 from madoc.pipeline.calibrated import Calibrated, calibration_ended, read_calibration
 from madoc.pipeline.calibration_stage import calibrate_in
 from madoc.pipeline.data_stage import Machine, load_source, read_truth, record_named, split_name
 from madoc.pipeline.evaluation_stage import evaluate_folder
 from madoc.pipeline.export_stage import export_run
-from madoc.pipeline.folders import ENDED, ended, holds_run, working_folder
-from madoc.pipeline.learning_stage import learn_in, require_no_goals, require_velocities
-from madoc.pipeline.methods import hyperparameters, make_method, methods_for
+from madoc.pipeline.learning_stage import learn_in
+from madoc.pipeline.methods import hyperparameters, learner_of, methods_for
 from madoc.pipeline.orders import (
     NO_PERMISSION,
     CalibrationOrder,
@@ -25,14 +25,12 @@ from madoc.pipeline.orders import (
     RecordOrder,
     RunOrder,
     Source,
-    parse_settings,
 )
-from madoc.pipeline.refusals import check_counts, check_drawing, check_order, check_place, check_search, policy_budget
-from madoc.policies import LEARNERS, require_reward
+from madoc.policies import require_reward
 from madoc.report.records import Summary, read_object, read_record
 from madoc.robots import is_spec_path
 from madoc.runs.files import read_json
-from madoc.types import entry_of
+from madoc.runs.run_folder import ENDED, ended, holds_run, working_folder
 
 
 def run_all(
@@ -65,8 +63,8 @@ def run_all(
         if result.status not in ENDED:
             return replace(summary, status=result.status, sentence=f"calibration: {result.sentence}")
         truth_known = calibrated.spec.truth is not None
-        learner = make_method(LEARNERS, order.learner, parse_settings(order.policy_set))
-        compared = order.yardsticks and truth_known and entry_of(learner, LEARNERS).needs_parameters
+        _, entry = learner_of(order.learner, order.policy_set)
+        compared = order.yardsticks and truth_known and entry.needs_parameters
         places: tuple[Place, ...] = (order.policy_at, *(("midrange", "truth") if compared else ()))
         for at in places:
             policy = _learn(order, calibrated, at, out / f"policy-{at}", quiet=quiet)
@@ -102,21 +100,22 @@ def _spec(order: RunOrder, machine: Machine, out: Path) -> dict[str, object]:
             if own
             else f"expected TASK-QUALITY to record, as {order.name}-medium, or --data FILE to load"
         )
-    check_counts(transition=order.transitions, episode=order.episodes, draw=order.draws)
+    refusals.check_counts(transition=order.transitions, episode=order.episodes, draw=order.draws)
     asked = _calibration_order(order, Source(order.data or (order.name,)))
-    check_order(asked, out)
-    check_search(order.search, machine.task, order.name)
+    refusals.check_order(asked, out)
+    refusals.check_search(order.search, machine.task, order.name)
     truth = read_truth(order.truth)
     if truth is not None:
         calibrated = order.search.parameters or machine.task.parameters.names
         machine.check_truth(truth, machine.task.with_parameters(list(calibrated)))
-    check_drawing(order.drawing, order.policy_at, "--policy-share and --policy-width are of --policy-at distribution")
-    learner = make_method(LEARNERS, order.learner, parse_settings(order.policy_set))
-    recognised = entry_of(learner, LEARNERS).name
-    check_place(recognised, order.policy_at, f"--policy-at {order.policy_at}")
-    require_no_goals(machine.task, recognised)
-    require_velocities(recognised, order.reading.disturbance, f"the data of {order.name}")
-    policy_budget(recognised, order.policy_budget)
+    refusals.check_drawing(
+        order.drawing, order.policy_at, "--policy-share and --policy-width are of --policy-at distribution"
+    )
+    learner, entry = learner_of(order.learner, order.policy_set)
+    refusals.check_place(entry.name, order.policy_at, f"--policy-at {order.policy_at}")
+    refusals.require_no_goals(machine.task, entry.name)
+    refusals.require_velocities(entry.name, order.reading.disturbance, f"the data of {order.name}")
+    refusals.policy_budget(entry.name, order.policy_budget)
     resolved = {
         "command": "run",
         "truth": truth,

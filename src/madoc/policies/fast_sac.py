@@ -20,31 +20,20 @@ What differs from `sac`, which is the paper's (arXiv 1812.05905), and where it c
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Annotated
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
-from pydantic import Field
 
 from madoc.errors import MadocError
 from madoc.learning import replay
-from madoc.learning.actor_critic import (
-    ActorCritic,
-    Batch,
-    Descent,
-    actor_step,
-    fresh,
-    soft_critic_step,
-    standardising,
-)
+from madoc.learning.actor_critic import ActorCritic, Batch, Descent, actor_step, fresh, soft_critic_step, standardising
 from madoc.learning.networks import scalars, scan_inputs
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, draw_rows, require_data
-from madoc.policies.interaction import Interaction, UniformPolicy, remember, roll_on, start_acting
-from madoc.policies.judging import Judged, judge
-from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, Share, check_hyperparameters
+from madoc.policies.interaction import Interaction, Judged, UniformPolicy, judge, remember, roll_on, start_acting
+from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, Several, Share, check_hyperparameters
 
 SMALLEST_DEVIATION = 1e-2
 """Added to the standard deviation of each observation value: a value that hardly moved yet may move far later."""
@@ -53,15 +42,7 @@ SMALLEST_DEVIATION = 1e-2
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class FastSACState:
-    """Everything the learner carries.
-
-    Attributes:
-        learner: Networks and optimisers.
-        interaction: Rows under way, the replay, and the mean and deviation of what was observed.
-        updates: Updates of the critics so far.
-        judged: The best policy so far; counts in updates.
-        key: Of all that is random from here on.
-    """
+    """The state of FastSAC; `judged` and `updates` count updates of the critics."""
 
     learner: ActorCritic
     interaction: Interaction
@@ -99,13 +80,13 @@ class FastSAC:
     steps_per_update: Count = 8
     policy_delay: Count = 2
     warmup_steps: Count = 10_000
-    batch: Annotated[int, Field(ge=2)] = 256
+    batch: Several = 256
     discount: Share = 0.99
     target_rate: Share = 0.005
     learning_rate: NotNegative = 1e-3
     replay_capacity: Count = 1_000_000
     standardise: bool = True
-    logged_share: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    logged_share: Share = 0.0
     judge_every: CountOrZero = 2_500
     judge_episodes: Count = 10
 

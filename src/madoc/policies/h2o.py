@@ -4,13 +4,11 @@ Niu et al. 2022 (arXiv 2206.13464).
 """
 
 from dataclasses import dataclass, replace
-from typing import Annotated
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
-from pydantic import Field
 
 from madoc.learning import replay
 from madoc.learning.actor_critic import ActorCritic, Batch, Descent, actor_step, bellman_target, critic_step, fresh
@@ -20,9 +18,8 @@ from madoc.learning.networks import Observations, PerRow, Scalar, adam, descend,
 from madoc.learning.sac_losses import TwinCritic
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies.base import PolicyProblem, draw_rows, require_data
-from madoc.policies.interaction import Interaction, check_epoch, explore_or_act, start_acting
-from madoc.policies.judging import Judged, judge
-from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, Share, check_hyperparameters
+from madoc.policies.interaction import Interaction, Judged, check_epoch, explore_or_act, judge, start_acting
+from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, Several, Share, check_hyperparameters
 
 RATIO_RANGE = (1e-5, 1.0)
 """Range to which the dynamics ratio is clipped; the authors'."""
@@ -142,7 +139,7 @@ class H2O:
     epoch_steps: Count = 1000
     updates_per_step: NotNegative = 1.0
     warmup_steps: CountOrZero = 1000
-    batch: Annotated[int, Field(ge=2)] = 256
+    batch: Several = 256
     weight: NotNegative = 0.01
     noise: NotNegative = 0.1
     gap_samples: Count = 10

@@ -150,15 +150,8 @@ def imagine(
     worth the worst, as in MOReL (Kidambi et al. 2020, section 4). Left out of the replay, as the authors of MOREC leave
     it, an action that leads there has no target at all, and the policy comes to prefer it.
 
-    Args:
-        models: What the rows are imagined in.
-        policy: The policy that acts.
-        under_way: The rows.
-        value: The values by which the models' uncertainty is measured as in MOBILE; None measures it as in MOPO.
-        horizon: Number of steps after which a row restarts.
-        penalty: The weight of the models' uncertainty in the reward.
-        steps: Number of steps.
-        key: Randomness.
+    Rows also restart after `horizon` steps. The models' uncertainty lowers the reward with the weight `penalty`; it is
+    measured by a `value` as in MOBILE, without one as in MOPO.
 
     Returns:
         The rows after the last step, the transitions flat in time and row, and metrics.

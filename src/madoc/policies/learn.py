@@ -1,16 +1,119 @@
-"""Run a policy learner on a problem."""
+"""Every policy learner by the name that `madoc methods` lists, a run of one, and policies as files.
 
+A file is an npz of plain arrays, readable without JAX by `madoc.numpy_policy`.
+"""
+
+import json
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
 from jaxtyping import PRNGKeyArray
 
+from madoc.errors import MadocError
+from madoc.learning.tanh_gaussian import TanhGaussianPolicy
+from madoc.numpy_policy import NumpyPolicy
 from madoc.policies.base import PolicyLearner, PolicyProblem, require_reward
-from madoc.policies.files import save_policy
-from madoc.policies.registry import LEARNERS
+from madoc.policies.bc import BC
+from madoc.policies.cql import CQL
+from madoc.policies.fast_sac import FastSAC
+from madoc.policies.h2o import H2O
+from madoc.policies.morec import MOREC
+from madoc.policies.sac import SAC
 from madoc.runs import loop
 from madoc.runs.budget import Budget
+from madoc.runs.files import replacing
 from madoc.runs.run_folder import RunFolder
-from madoc.types import Policy, State, Unit, entry_of
+from madoc.types import MethodEntry, Policy, State, Unit, entry_of
+
+CLONING = {"cloning": 2.5}
+"""SAC+BC's weight of SAC's loss beside the cloning error: TD3+BC's."""
+
+SAC_SHOWN = ("return_in_simulator", "temperature")
+
+_sac = partial(MethodEntry[PolicyLearner[Any]], kind=SAC, shown=SAC_SHOWN)
+_fast_sac = partial(MethodEntry[PolicyLearner[Any]], kind=FastSAC, shown=SAC_SHOWN, usual_budget=2_400_000)
+_offline = partial(MethodEntry[PolicyLearner[Any]], unit="updates", simulates=False, needs_parameters=False)
+
+_ENTRIES: tuple[MethodEntry[PolicyLearner[Any]], ...] = (
+    _sac(
+        name="sac",
+        summary="SAC in the calibrated simulator",
+        paper="Haarnoja et al., SAC",
+        year=2018,
+        needs_data=False,
+    ),
+    _fast_sac(
+        name="fast-sac",
+        summary="SAC for cheap simulation",
+        paper="Li et al., PQL",
+        year=2023,
+        needs_data=False,
+    ),
+    _fast_sac(
+        name="rlpd",
+        summary="fast-sac, half of each batch logged",
+        paper="Ball et al., RLPD",
+        year=2023,
+        settings={"logged_share": 0.5},
+    ),
+    _sac(
+        name="sac-bc",
+        summary="SAC, cloning the data's actions too",
+        paper="Jiang et al., Madoc",
+        year=2024,
+        settings=CLONING,
+    ),
+    _sac(
+        name="dr",
+        summary="SAC over the whole box",
+        paper="Tobin et al., randomization",
+        year=2017,
+        settings={"randomize": True},
+        needs_data=False,
+        needs_parameters=False,
+    ),
+    _sac(
+        name="dr-bc",
+        summary="SAC over the whole box, cloning the data",
+        paper="Tobin et al., randomization",
+        year=2017,
+        settings=CLONING | {"randomize": True},
+        needs_parameters=False,
+    ),
+    _offline("bc", BC, "clones the data's policy", "Pomerleau, ALVINN", 1988, shown=("cloning_loss",)),
+    _offline(
+        "cql",
+        CQL,
+        "conservative values, from the data alone",
+        "Kumar et al., CQL",
+        2020,
+        shown=("conservative_gap", "value_target", "temperature"),
+    ),
+    _offline(
+        "morec",
+        MOREC,
+        "a learnt model, kept to what looks real",
+        "Luo et al., MOREC",
+        2024,
+        shown=("model_error", "net_reward", "value_target"),
+    ),
+    MethodEntry(
+        "h2o",
+        H2O,
+        "SAC on logged and trusted simulated rows",
+        "Niu et al., H2O",
+        2022,
+        shown=("return_in_simulator", "dynamics_ratio", "value_target"),
+    ),
+)
+
+LEARNERS: dict[str, MethodEntry[PolicyLearner[Any]]] = {entry.name: entry for entry in _ENTRIES}
 
 
 @dataclass(frozen=True)
@@ -70,3 +173,46 @@ def learn_policy(
     seconds = round(finished.seconds, 3)
     counts = finished.control_steps, finished.updates, finished.spent, entry.unit, seconds
     return LearnedPolicy(policy, finished.status, finished.sentence, *counts)
+
+
+def save_policy(policy: TanhGaussianPolicy, path: str | Path, *, task_name: str) -> None:
+    """Write a policy as float32 arrays, with matrices of shape (inputs, outputs), whole or not at all."""
+    layers = policy.network.layers
+    arrays: dict[str, np.ndarray] = {"about": np.array(json.dumps({"task": task_name, "layers": len(layers)}))}
+    for index, layer in enumerate(layers):
+        arrays[f"weight_{index}"] = np.asarray(layer.weight.T)
+        arrays[f"bias_{index}"] = np.asarray(layer.bias)
+    arrays |= {"offset": np.asarray(policy.offset), "scale": np.asarray(policy.scale)}
+    with replacing(Path(path)) as stream:
+        np.savez(stream, allow_pickle=False, **arrays)
+
+
+def load_policy(path: str | Path) -> TanhGaussianPolicy:
+    """Read a policy.
+
+    Raises:
+        MadocError: The file is missing or is not a policy that Madoc saved.
+    """
+    try:
+        return policy_of(NumpyPolicy.load(path))
+    except ValueError as error:
+        raise MadocError(str(error)) from error
+
+
+def policy_of(saved: NumpyPolicy) -> TanhGaussianPolicy:
+    """A JAX policy with the weights of a saved one."""
+    sizes = [weight.shape[1] for weight in saved.weights]
+    policy = TanhGaussianPolicy(len(saved.offset), sizes[-1] // 2, tuple(sizes[:-1]), key=jax.random.key(0))
+    layers = [
+        eqx.tree_at(
+            lambda linear: (linear.weight, linear.bias),
+            layer,
+            (jnp.asarray(weight.T, jnp.float32), jnp.asarray(bias, jnp.float32)),
+        )
+        for layer, weight, bias in zip(policy.network.layers, saved.weights, saved.biases, strict=True)
+    ]
+    return eqx.tree_at(
+        lambda parts: (parts.network.layers, parts.offset, parts.scale),
+        policy,
+        (layers, jnp.asarray(saved.offset, jnp.float32), jnp.asarray(saved.scale, jnp.float32)),
+    )

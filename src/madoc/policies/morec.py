@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Annotated, Literal
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
-from pydantic import Field
 
 from madoc.errors import MadocError
 from madoc.learning import replay
@@ -33,8 +32,8 @@ from madoc.policies.imagination import (
     start_imagining,
     worst_value,
 )
-from madoc.policies.judging import Judged
-from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, Share, check_hyperparameters
+from madoc.policies.interaction import Judged
+from madoc.types import BelowOne, Count, CountOrZero, Epoch, Layers, NotNegative, Several, Share, check_hyperparameters
 
 
 @jax.tree_util.register_dataclass
@@ -143,13 +142,13 @@ class MOREC:
     horizon: Count = 100
     uncertainty: Literal["mobile", "mopo"] = "mopo"
     penalty: NotNegative = 1.0
-    real: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.5
+    real: BelowOne = 0.5
     imagined_per_update: Count = 10
     imagined_rows: Count = 200
     epoch_updates: Count = 100
-    holdout_every: Annotated[int, Field(ge=2)] = 100
-    batch: Annotated[int, Field(ge=2)] = 256
-    discount: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.995
+    holdout_every: Several = 100
+    batch: Several = 256
+    discount: BelowOne = 0.995
     target_rate: Share = 0.005
     model_learning_rate: NotNegative = 1e-3
     policy_learning_rate: NotNegative = 3e-4

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from madoc.evaluation import evaluate
-from madoc.policies.systems import NormalParameters
+from madoc.policies.base import NormalParameters
 from madoc.simulation.base import Simulator
 from madoc.types import Policy
 

@@ -11,24 +11,15 @@ from madoc.learning.actor_critic import ActorCritic, Batch, Descent, actor_step,
 from madoc.learning.networks import scalars, scan_inputs
 from madoc.learning.sac_losses import cloned_actor_loss, cloning_error
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
-from madoc.policies.base import PolicyProblem, draw_rows, require_data
-from madoc.policies.interaction import Interaction, check_epoch, explore_or_act, start_acting
-from madoc.policies.judging import Judged, judge
-from madoc.policies.systems import UniformParameters
+from madoc.policies.base import PolicyProblem, UniformParameters, draw_rows, require_data
+from madoc.policies.interaction import Interaction, Judged, check_epoch, explore_or_act, judge, start_acting
 from madoc.types import Count, CountOrZero, Epoch, Layers, NotNegative, Share, check_hyperparameters
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class SACState:
-    """The state of SAC.
-
-    Attributes:
-        learner: Policy, critics and their optimisers.
-        interaction: The replay, and the episodes under way in the simulator.
-        judged: The best policy so far, and when it was judged, in control steps.
-        key: The random key.
-    """
+    """The state of SAC; `judged` counts in control steps."""
 
     learner: ActorCritic
     interaction: Interaction
@@ -101,8 +92,9 @@ class SAC:
     def step(self, problem: PolicyProblem, state: SACState) -> tuple[SACState, Epoch]:
         """Act for `epoch_steps` control steps, then update, then judge the policy where that is due."""
         of_acting, of_update, of_judging, key = jax.random.split(state.key, 4)
+        place = self._place(problem)
         interaction, epoch, due = explore_or_act(
-            self._place(problem),
+            place,
             state.interaction,
             state.learner.policy,
             of_acting,
@@ -115,14 +107,11 @@ class SAC:
             logged = problem.logged if self.cloning is not None else None
             learner, losses = self._update(learner, interaction.replay, logged, of_update, due)
             epoch = replace(epoch, metrics=epoch.metrics | scalars(losses))
-        following = replace(state, learner=learner, interaction=interaction, key=key)
-        if state.judged.due(interaction.control_steps, self.judge_every) and learner is not state.learner:
-            place, spent = self._place(problem), interaction.control_steps
-            judged, epoch = judge(
-                place, learner.policy, state.judged, epoch, of_judging, episodes=self.judge_episodes, spent=spent
-            )
-            following = replace(following, judged=judged)
-        return following, epoch
+        judged, spent = state.judged, interaction.control_steps
+        if judged.due(spent, self.judge_every) and learner is not state.learner:
+            policy = learner.policy
+            judged, epoch = judge(place, policy, judged, epoch, of_judging, episodes=self.judge_episodes, spent=spent)
+        return SACState(learner, interaction, judged, key), epoch
 
     @eqx.filter_jit
     def _update(

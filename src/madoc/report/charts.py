@@ -56,16 +56,10 @@ def line_chart(
     levels: Sequence[Level] = (),
     log: bool = False,
 ) -> Markup:
-    """Lines over a shared axis.
+    """Lines over a shared, ascending axis, the last on top; the label says what they show to those who cannot see it.
 
-    Args:
-        x: Ascending.
-        lines: What is drawn, the last on top.
-        label: What it shows, for those who cannot see it.
-        x_title: Under the axis.
-        y_range: Of the vertical axis; None fits what is drawn.
-        levels: Horizontal lines.
-        log: The vertical axis in powers of ten; values that are not positive are left out.
+    Without `y_range`, the vertical axis fits what is drawn. With `log` it is in powers of ten, and values that are not
+    positive are left out.
     """
     data = [trace for line in lines for trace in _traces(x, line)]
     for level in levels:

@@ -18,7 +18,7 @@ from madoc.errors import MadocError
 from madoc.report.records import EvaluationRecord, SpecRecord, read_object, read_record, read_spec
 from madoc.robots.document import yaml_text
 from madoc.runs.files import read_bytes
-from madoc.runs.memory import read_peak
+from madoc.runs.machine import read_peak
 
 
 @dataclass(frozen=True)
@@ -110,13 +110,7 @@ class Run:
         whole: The folder that the user named: the calibration's, or that of `madoc run` around it.
         spec: What the calibration was asked to do.
         spec_text: All of its `spec.json` but for versions and robot, as YAML.
-        result: Its result; None while it has not ended.
-        status: How it ended; None while it has not.
-        sentence: The status in words.
-        log: Its metrics.
-        evidence: Held-out runs beside their simulation.
-        embeddings: What it learnt about which parameters act alike.
-        evaluation: Returns of policies, in the target where it is known and at the estimate.
+        result: None while it has not ended, as `status`, and `sentence`, the status in words.
     """
 
     name: str

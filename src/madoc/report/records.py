@@ -43,15 +43,10 @@ class SpecRecord:
 
     Attributes:
         command: `calibrate`, `learn` or `run`; empty where there is no such file.
-        task: Name of the robot.
-        method: Name of the calibrator or learner, or `auto`.
-        physics: `legacy` or `modern`.
         parameters: Range of each calibrated parameter, or its value where a policy was learnt.
-        seed: Seed of all random numbers.
         at: Where a policy was learnt: `calibrated`, `truth`, `midrange`, ...; None of a calibration.
         truth: True values by name, where they are known.
         holdout: Share of the rows that was held out; None where the result was not judged.
-        data: The logged data.
         robot: Name and text of the spec file of a user's own robot, and its model; None for one of Madoc's.
         versions: Versions of the packages that can change a result's last bits.
     """
@@ -75,8 +70,6 @@ class EvaluationRecord:
     """The content of `evaluation.json`.
 
     Attributes:
-        task: Name of the robot.
-        physics: `legacy` or `modern`.
         episodes: Number of episodes of each policy.
         seed: Seed of the starts.
         policies: In the target, by name: `return` and `return_std` over episodes, `normalized` score and mean `length`;
@@ -110,15 +103,10 @@ class Summary:
     Attributes:
         name: The robot and the quality of its data, as the user named them.
         status: `finished`, or how the stage ended that was interrupted or diverged.
-        sentence: The status in words.
-        task: Name of the robot.
-        physics: `legacy` or `modern`.
-        seed: Seed of all random numbers.
         data: `transitions` and `fingerprint`.
         calibration: The result, as `CalibrationResult.to_json` writes it.
         policies: How the learning of each policy ended, by name.
-        evaluation: Returns of the policies, in the target where it is known and at the estimate; None where the run
-            stopped before.
+        evaluation: None where the run stopped before.
     """
 
     name: str

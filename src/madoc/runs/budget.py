@@ -46,11 +46,7 @@ _TIME_UNITS = {"s": 1.0, "min": 60.0, "h": 3600.0}
 
 
 def read_budget(given: Budget | str, unit: Unit = "control steps") -> Budget:
-    """A budget as written: `300000` is a count, `300s`, `15min` and `2h` are times.
-
-    Args:
-        given: The budget, read already or not.
-        unit: What it counts where it is a count.
+    """A budget as written, or read already: `300000` is a count of the unit, `300s`, `15min` and `2h` are times.
 
     Raises:
         MadocError: It is neither, or not positive.

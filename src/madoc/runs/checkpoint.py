@@ -122,9 +122,7 @@ def save(path: Path, state: object, extra: Mapping[str, object]) -> None:
 def load(path: Path, like: State) -> tuple[State, dict[str, Any]]:
     """Read the state and the extra dictionary that `save` wrote.
 
-    Args:
-        path: The file.
-        like: A state from the method's `init`, which gives the structure and the functions.
+    The structure and the functions are those of `like`, a state from the method's `init`.
 
     Raises:
         OtherState: The file holds the state of another method, setting or version.

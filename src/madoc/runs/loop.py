@@ -14,9 +14,8 @@ from jaxtyping import PRNGKeyArray
 from madoc.errors import MadocError
 from madoc.runs import checkpoint
 from madoc.runs.budget import Budget, Seconds, read_budget
-from madoc.runs.interruption import interruptible
-from madoc.runs.memory import forget_peak, peak_memory, write_peak
-from madoc.runs.progress import Moment, display
+from madoc.runs.machine import forget_peak, peak_memory, write_peak
+from madoc.runs.progress import Moment, display, interruptible
 from madoc.runs.run_folder import RunFolder, RunLog
 from madoc.types import Epoch, Method, Metrics, Problem, State, Unit
 

@@ -1,11 +1,14 @@
-"""Progress on standard error: a bar in a terminal, a line every few seconds anywhere else."""
+"""What a user sees of work under way, a bar in a terminal and lines anywhere else, and how it is asked to stop."""
 
+import signal
 import sys
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from types import FrameType
 
 from madoc.types import Metrics
 
@@ -192,3 +195,41 @@ def _clock(seconds: float) -> str:
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+class Interruption:
+    """Ctrl-C or SIGTERM as a request to stop, which is obeyed between two steps; a second one breaks a step off."""
+
+    def __init__(self) -> None:
+        self.asked = False
+        self._breakable = False
+
+    @contextmanager
+    def breakable(self) -> Iterator[None]:
+        """A block that a second request leaves with KeyboardInterrupt; no files may be written in it."""
+        self._breakable = True
+        try:
+            yield
+        finally:
+            self._breakable = False
+
+    def ask(self, number: int, frame: FrameType | None) -> None:
+        """The signal handler."""
+        if self.asked and self._breakable:
+            raise KeyboardInterrupt
+        self.asked = True
+
+
+@contextmanager
+def interruptible() -> Iterator[Interruption]:
+    """Handle SIGINT and SIGTERM in the block, if it runs in the main thread; other threads may not."""
+    interruption = Interruption()
+    previous = {}
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM):
+            previous[number] = signal.signal(number, interruption.ask)
+    try:
+        yield interruption
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler if handler is not None else signal.SIG_DFL)

@@ -1,12 +1,12 @@
 """The folder of one run: its settings, its logs and its checkpoint, written by one process at a time."""
 
-import contextlib
 import os
 import platform
+import shutil
 import time
 import warnings
-from collections.abc import Mapping
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 
 import filelock
@@ -14,8 +14,11 @@ import numpy as np
 
 from madoc.errors import MadocError
 from madoc.runs.files import json_text, read_json, remove_leftovers, write_json
-from madoc.runs.versions import versions
+from madoc.runs.machine import versions
 from madoc.types import Metrics, Unit
+
+ENDED = ("finished", "converged")
+"""The statuses of a run after which the next one may start."""
 
 _FREE = ("budget", "versions")
 """Keys of a spec that may differ when a run is resumed."""
@@ -124,6 +127,43 @@ class RunFolder:
             self.write_json("spec.json", self.spec)
 
 
+@contextmanager
+def working_folder(
+    path: Path, spec: dict[str, object], *, resume: bool, keep: str = "checkpoint.npz"
+) -> Iterator[RunFolder]:
+    """The locked folder of a run with these settings: a new one, or with `resume` that of an earlier run.
+
+    A new folder is deleted if the run is refused before it has the file `keep`, the first worth keeping.
+
+    Raises:
+        MadocError: As `RunFolder.create` and `RunFolder.open`.
+    """
+    path = path.expanduser()
+    made = not path.exists()
+    folder = RunFolder.open(path, spec) if resume else RunFolder.create(path, spec)
+    try:
+        with folder:
+            yield folder
+    except MadocError:
+        if not resume and not (path / keep).exists():
+            (path / "spec.json").unlink(missing_ok=True)
+            if made:
+                shutil.rmtree(path, ignore_errors=True)
+        raise
+
+
+def holds_run(path: Path) -> bool:
+    """Whether a run has been started in a folder."""
+    return (path / "spec.json").exists()
+
+
+def ended(path: Path, also: str | None = None) -> bool:
+    """Whether the run in a folder has ended, and the file `also` is there as well."""
+    if not (path / "result.json").exists() or (also is not None and not (path / also).exists()):
+        return False
+    return read_json(path / "result.json").get("status") in ENDED
+
+
 class RunLog:
     """The logs of a run, `metrics.jsonl` and TensorBoard events; as a context manager it closes them.
 
@@ -151,7 +191,7 @@ class RunLog:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        with contextlib.closing(self._events), self._lines:  # both, even if one has no room for what it holds
+        with closing(self._events), self._lines:  # both, even if one has no room for what it holds
             pass
 
     def append(self, metrics: Metrics, *, stage: str, spent: int, seconds: float) -> None:

@@ -13,8 +13,8 @@ from pathlib import Path
 from madoc import robots
 from madoc.calibration import CALIBRATORS
 from madoc.errors import MadocError, unknown_name
-from madoc.pipeline.keys import check_seed
-from madoc.pipeline.methods import candidates_for, make_method
+from madoc.pipeline import refusals
+from madoc.pipeline.methods import candidates_for, learner_of, make_method
 from madoc.pipeline.orders import (
     AUTO,
     NO_PERMISSION,
@@ -28,21 +28,10 @@ from madoc.pipeline.orders import (
     Settings,
     parse_settings,
 )
-from madoc.pipeline.refusals import (
-    check_counts,
-    check_drawing,
-    check_order,
-    check_place,
-    check_search,
-    method_of,
-    policy_budget,
-)
-from madoc.policies import LEARNERS, require_reward
+from madoc.policies import require_reward
 from madoc.runs.files import read_json
-from madoc.suites.cells import Kind, hashed
-from madoc.suites.options import Misfit, Order, stored
+from madoc.suites.cells import Kind, Misfit, Order, hashed, stored
 from madoc.tasks import TASKS, Task
-from madoc.types import entry_of
 
 
 @contextmanager
@@ -69,15 +58,15 @@ def check_calibration(order: CalibrationOrder, *, recorded: bool, permission: Pe
         task = _robot(order.task, search.physics, permission)
     with under("level" if search.parameters is None else "parameters"):
         _ranges(order.task, search.physics, search.parameters, search.level, permission)
-    method = method_of(order)
+    method = refusals.method_of(order)
     with under("method"):
         _calibrator(method, ())
     with under("set"):
         _calibrator(method, search.set)
     with under("seed"):
-        check_seed(search.seed)
+        refusals.check_seed(search.seed)
     with under("holdout" if order.holdout is not None and not 0 < order.holdout < 1 else "budget"):
-        check_order(order)
+        refusals.check_order(order)
     with under("format"):
         _check_format(order.source.reading.format)
     with under("max_transitions"):
@@ -98,41 +87,33 @@ def check_policy(
     *,
     permission: Permission = NO_PERMISSION,
 ) -> None:
-    """Refuse a policy that cannot be learnt of a calibrated robot.
-
-    Args:
-        order: The policy.
-        calibration: The calibration that it needs.
-        recording: What that takes; None where it takes a log.
-        permission: What specs of robots may ask for.
+    """Refuse a policy that cannot be learnt of a calibrated robot, whose calibration takes a recording or else a log.
 
     Raises:
         Misfit: Names the key.
     """
-    from madoc.pipeline.learning_stage import require_no_goals, require_velocities  # reads data formats too
-
     task = _robot(calibration.task, calibration.search.physics, permission)
     with under("method"):
         _learner(order.method, ())
     with under("set"):
         learner = _learner(order.method, order.set)
     with under("budget"):
-        policy_budget(learner, order.budget)
+        refusals.policy_budget(learner, order.budget)
     with under("at"):
-        check_place(learner, order.at, f"at: {order.at}")
+        refusals.check_place(learner, order.at, f"at: {order.at}")
         truths = (order.truth, calibration.truth, recording)
         if order.at == "truth" and not any(truths) and not _may_tell_truth(calibration.source.paths):
             raise MadocError("the true parameters are not known here; add truth: FILE.json")
     with under("share" if order.drawing.share != Drawing().share else "width"):
-        check_drawing(order.drawing, order.at, "share: and width: are of at: distribution")
+        refusals.check_drawing(order.drawing, order.at, "share: and width: are of at: distribution")
     with under(""):
         require_reward(task)
     with under("method"):
-        require_no_goals(task, learner)
+        refusals.require_no_goals(task, learner)
         for disturbance in (calibration.source.reading.disturbance, *((recording.disturbance,) if recording else ())):
-            require_velocities(learner, disturbance, "the data of this cell")
+            refusals.require_velocities(learner, disturbance, "the data of this cell")
     with under("seed"):
-        check_seed(order.seed)
+        refusals.check_seed(order.seed)
     _check_truth(order.truth, calibration, permission)
 
 
@@ -148,11 +129,11 @@ def check_recording(order: RecordOrder) -> None:
         if not split_name(order.name)[1]:
             raise MadocError(f"expected TASK-QUALITY to record, as hopper-medium, got {order.name!r}")
     with under("transitions"):
-        check_counts(transition=order.transitions)
+        refusals.check_counts(transition=order.transitions)
     with under("friction"):
         replace(order.disturbance, friction=order.friction)
     with under("seed"):
-        check_seed(order.seed)
+        refusals.check_seed(order.seed)
 
 
 def check_evaluation(
@@ -164,11 +145,11 @@ def check_evaluation(
         Misfit: Names the key.
     """
     with under("episodes"):
-        check_counts(episode=order.episodes)
+        refusals.check_counts(episode=order.episodes)
     with under("draws"):
-        check_counts(draw=order.draws)
+        refusals.check_counts(draw=order.draws)
     with under("seed"):
-        check_seed(order.seed)
+        refusals.check_seed(order.seed)
     _check_truth(order.truth, calibration, permission)
 
 
@@ -269,7 +250,9 @@ def _robot(task: str, physics: str | None, permission: Permission) -> Task:
 def _ranges(
     task: str, physics: str | None, parameters: tuple[str, ...] | None, level: str, permission: Permission
 ) -> None:
-    check_search(Search(parameters=parameters, level=level), _robot(task, physics, permission), Path(task).name)
+    refusals.check_search(
+        Search(parameters=parameters, level=level), _robot(task, physics, permission), Path(task).name
+    )
 
 
 @cache
@@ -312,5 +295,5 @@ def _calibrator(method: str, settings: Settings) -> None:
 
 @cache
 def _learner(method: str, settings: Settings) -> str:
-    """The name of what a learner is with its settings: `sac` that is told to randomize is `dr`."""
-    return entry_of(make_method(LEARNERS, method, parse_settings(settings)), LEARNERS).name
+    """The name of what a learner is with its settings."""
+    return learner_of(method, settings)[1].name

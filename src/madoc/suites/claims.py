@@ -13,8 +13,8 @@ from typing import Literal
 import filelock
 
 from madoc.errors import MadocError
-from madoc.pipeline.folders import ENDED
 from madoc.runs.files import read_json, remove_leftovers, write_json
+from madoc.runs.run_folder import ENDED
 from madoc.suites.cells import Cell
 
 Ending = Literal["finished", "converged", "diverged", "refused", "failed"]
@@ -52,13 +52,7 @@ class Outcome:
 
 
 class Claim:
-    """A cell that this process alone works on.
-
-    Attributes:
-        cell: The cell.
-        folder: Its run folder.
-        attempts: How often it was begun without getting further, this time included.
-    """
+    """A cell that this process alone works on; `attempts` to get further were made in its folder, this one included."""
 
     def __init__(self, cell: Cell, folder: Path, *, fresh: bool) -> None:
         self.cell, self.folder, self._fresh = cell, folder, fresh
@@ -79,11 +73,6 @@ class Claim:
 @contextmanager
 def claimed(cell: Cell, suite: Path, *, fresh: bool = False) -> Iterator[Claim | None]:
     """A cell claimed for the block; None where another process has it, or it has ended.
-
-    Args:
-        cell: The cell.
-        suite: The folder of the suite.
-        fresh: Whether it is the first cell of this process.
 
     Raises:
         MadocError: Its folder cannot be made or locked.

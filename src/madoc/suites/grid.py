@@ -66,10 +66,7 @@ def read_suite(path: Path) -> tuple[SuiteFile, Document]:
 def combinations(suite: SuiteFile, document: Document, folder: Path) -> Iterator[Combination]:
     """Every combination of every entry, in the order of the file; the last key of a grid changes fastest.
 
-    Args:
-        suite: The file.
-        document: Its lines.
-        folder: Where it lies; the logs of robots are searched from there.
+    The logs of robots are searched from the folder of the file.
 
     Raises:
         MadocError: A grid is empty or endless, or no log is found; the sentence names the line.

@@ -5,18 +5,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from madoc.errors import nearest_hint
 from madoc.pipeline.orders import NO_PERMISSION, CalibrationOrder, EvaluationOrder, Permission, PolicyOrder, RecordOrder
 from madoc.robots.document import Document
 from madoc.suites import checks
-from madoc.suites.cells import RECORDED, Cell, Kind
+from madoc.suites.cells import RECORDED, Asked, Cell, Kind, Misfit, Order, build, keys_of, stored
 from madoc.suites.grid import GRID, ROBOTS, Combination, combinations, read_suite
-from madoc.suites.options import Misfit, Order, build, keys_of, stored
 from madoc.tasks import TASKS
-
-Asked = TypeVar("Asked", RecordOrder, CalibrationOrder, PolicyOrder, EvaluationOrder)
 
 PARTS: Mapping[str, str] = {"record": "name", "learn": "method", "evaluate": "episodes"}
 """Parts of an entry that are orders of their own, and the key that a bare value of each stands for."""

@@ -11,11 +11,9 @@ from madoc.report.page import write_page
 from madoc.report.words import TONES
 from madoc.runs.files import write_json
 from madoc.suites.cells import Cell
-from madoc.suites.fleet import Fleet, fleets, ranges
-from madoc.suites.listing import asked
 from madoc.suites.planning import Plan
-from madoc.suites.results import NOT_RUN, Result, results_of, rows, write_csv, write_parquet
-from madoc.suites.standing import Standing
+from madoc.suites.results import NOT_RUN, Fleet, Result, fleets, ranges, results_of, rows, write_csv, write_parquet
+from madoc.suites.standing import Standing, asked
 
 LARGEST_PAGE = 2000
 """Largest number of single cells on the page; the tables have all."""
@@ -53,15 +51,8 @@ def write_report(
 ) -> dict[str, Path]:
     """Leave `SUITE.html` and `SUITE.csv` in the folder of a suite, and `SUITE-fleet.json` where it has several robots.
 
-    Args:
-        plan: The suite.
-        standing: How far it is.
-        suite: Its folder.
-        command: What runs the cells that were not run.
-        parquet: Leave `SUITE.parquet` too.
-
-    Returns:
-        The files by what they are.
+    With `parquet`, leave `SUITE.parquet` too. The command is what runs the cells that were not run. Returns the files
+    by what they are.
 
     Raises:
         MadocError: The suite was never begun, a result is damaged, or a file cannot be written.

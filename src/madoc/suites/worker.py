@@ -10,13 +10,12 @@ from pathlib import Path
 from madoc import data
 from madoc.errors import MadocError, NotAllowed
 from madoc.pipeline import calibrate_in, evaluate_folder, learn_in, read_calibration, record_named
-from madoc.pipeline.folders import ENDED, holds_run
 from madoc.pipeline.orders import NO_PERMISSION, CalibrationOrder, EvaluationOrder, Permission, PolicyOrder, RecordOrder
 from madoc.runs.checkpoint import OtherState
-from madoc.suites.cells import RECORDED, Cell, read_plans
+from madoc.runs.run_folder import ENDED, holds_run
+from madoc.suites.cells import RECORDED, Cell, Order, read_plans
 from madoc.suites.checks import forget_contents, name_of
 from madoc.suites.claims import MOST_ATTEMPTS, Claim, Outcome, attempts_of, claimed, outcome_of
-from madoc.suites.options import Order
 
 _LAST = 3
 """How often a cell is begun without getting any further before it has to wait for all others."""
@@ -30,13 +29,8 @@ def work(
     """Carry out cells of a suite's plans until none is left that this process could begin.
 
     Any number of processes, on any number of machines that share the folder, may do this at once: each cell is done
-    by one of them. A cell that another process has is left to it, but waited for where others need its result.
-
-    Args:
-        suite: The folder of the suite.
-        names: Only these cells. Default: all.
-        plan: Only the cells of this plan. Default: of all.
-        permission: What specs of robots may ask for.
+    by one of them. A cell that another process has is left to it, but waited for where others need its result. By
+    default they are all cells of all plans.
 
     Returns:
         How the cells ended that this process did; None where it was interrupted.
@@ -45,19 +39,12 @@ def work(
         NotAllowed: A spec asks for what is not allowed; the cell is left to others, and all
             that could be done without it is done.
     """
-    planned = {cell.name: cell for cell in read_plans(suite, plan)}
-    cells = list(planned.values()) if names is None else [planned[name] for name in names]
-    return _work(suite, cells, planned, permission=permission)
-
-
-def _work(
-    suite: Path, cells: Sequence[Cell], known: dict[str, Cell], *, permission: Permission
-) -> list[Outcome] | None:
-    """The loop of `work`."""
+    known = {cell.name: cell for cell in read_plans(suite, plan)}
     done: list[Outcome] = []
     not_allowed: NotAllowed | None = None
     in_vain: set[str] = set()
-    waiting, pause, patient = deque(cells), _PAUSES[0], True
+    waiting = deque(known.values() if names is None else [known[name] for name in names])
+    pause, patient = _PAUSES[0], True
     while waiting:
         later: deque[Cell] = deque()
         blocked, progressed, postponed = False, False, False
@@ -103,10 +90,9 @@ def _work(
 
 
 def carry_out(claim: Claim, suite: Path, *, permission: Permission = NO_PERMISSION) -> Outcome | None:
-    """Do what a cell asks, or go on with it where an earlier process was stopped.
+    """Do what a cell asks, or go on with it where an earlier process was stopped; how it ended.
 
-    Returns:
-        How it ended; None where it was interrupted, and the next process goes on.
+    It is None where the cell was interrupted, and the next process goes on.
 
     Raises:
         NotAllowed: A spec asks for what is not allowed.

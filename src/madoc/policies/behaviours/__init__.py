@@ -20,7 +20,7 @@ from madoc.data.record import record
 from madoc.data.targets import paper_truth
 from madoc.errors import MadocError, unknown_name
 from madoc.numpy_policy import NumpyPolicy
-from madoc.policies.files import policy_of
+from madoc.policies.learn import policy_of
 from madoc.simulation.base import Simulator
 
 QUALITIES = ("medium", "medium-replay", "medium-expert", "neorl-low", "neorl-medium", "neorl-high")

@@ -6,12 +6,10 @@ The macro of `templates/parts.html` with the section's name draws it.
 from collections.abc import Callable, Mapping
 
 from madoc.report.reading import Run
-from madoc.report.sections.adequacy import lacks, together
 from madoc.report.sections.course import curves, trace
-from madoc.report.sections.estimates import correlations, estimates, grouping
+from madoc.report.sections.estimates import correlations, estimates, grouping, lacks, together
 from madoc.report.sections.holdout import holdout, residuals, signals
-from madoc.report.sections.outcome import asked, cost, policies
-from madoc.report.sections.robustness import film, motion, robustness
+from madoc.report.sections.outcome import asked, cost, film, motion, policies, robustness
 
 SECTIONS: Mapping[str, tuple[str, Callable[[Run], dict[str, object] | str]]] = {
     "motion": ("The robot in a held-out run", motion),

@@ -2,7 +2,7 @@ import pytest
 
 from madoc.suites.cells import Cell
 from madoc.suites.claims import Outcome
-from madoc.suites.forecast import forecast
+from madoc.suites.standing import forecast
 
 
 def cell(name, method="droid", budget=1000, seed=0, data="log"):

@@ -6,10 +6,9 @@ from madoc.calibration.holdout import Verdict
 from madoc.calibration.result import CalibrationResult, ParameterEstimate
 from madoc.report.page import write_page
 from madoc.suites.cells import Cell
-from madoc.suites.fleet import fleets, ranges
 from madoc.suites.planning import Plan
 from madoc.suites.report import _context
-from madoc.suites.results import Result
+from madoc.suites.results import Result, fleets, ranges
 from madoc.suites.standing import Standing
 
 

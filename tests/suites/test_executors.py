@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from madoc.commands.main import main
-from madoc.suites import on_ray
+from madoc.suites import executors
 from madoc.suites.cells import write_plan
 from madoc.suites.claims import claimed, outcome_of
 from madoc.suites.planning import plan_of
@@ -21,14 +21,14 @@ with_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="t
 
 
 def test_a_task_does_its_cell_and_no_other_and_says_when_another_process_has_it(suite, place, monkeypatch):
-    monkeypatch.setattr("madoc.suites.process.prepare", lambda: None)
-    monkeypatch.setattr(on_ray, "_WAIT", 0.01)
+    monkeypatch.setattr("madoc.suites.executors.prepare_worker", lambda: None)
+    monkeypatch.setattr(executors, "_WAIT", 0.01)
     cells = plan_of(suite(CELL + "    grid: {seed: 0..1}\n")).cells
     write_plan(place / "out", "suite", cells)
     with claimed(cells[1], place / "out"):
-        monkeypatch.setattr(on_ray.time, "sleep", lambda seconds: None)
-        assert on_ray.do_cell(str(place / "out"), cells[1].name, "suite") == ""
-    assert on_ray.do_cell(str(place / "out"), cells[0].name, "suite") == "finished"
+        monkeypatch.setattr(executors.time, "sleep", lambda seconds: None)
+        assert executors.do_cell(str(place / "out"), cells[1].name, "suite") == ""
+    assert executors.do_cell(str(place / "out"), cells[0].name, "suite") == "finished"
     assert outcome_of(cells[1], place / "out") is None
 
 

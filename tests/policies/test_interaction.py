@@ -1,14 +1,19 @@
-"""Which policy is handed back: the best where it can be judged, else the last."""
+"""What acting in simulated systems keeps: moments of what was seen, and the policy that is handed back.
+
+Mean and deviation of rows that come in batches are those of all rows at a time. The policy is the best where it can be
+judged, else the last.
+"""
 
 from dataclasses import replace
 
 import jax
+import numpy as np
 
 from madoc import simulation
 from madoc.learning.tanh_gaussian import TanhGaussianPolicy
 from madoc.policies import PolicyProblem
 from madoc.policies.h2o import H2O
-from madoc.policies.judging import Judged
+from madoc.policies.interaction import Judged, Moments
 from robots import ARM_TRUTH, recorded, two_link_arm
 
 
@@ -41,3 +46,19 @@ def test_h2o_hands_back_the_best_in_its_simulator():
     assert state.judged.best_return == best
     last = replace(method, judge_every=0)
     assert last.policy(replace(state, judged=Judged.none(policy))) is state.learning.learner.policy
+
+
+def test_batches_add_up_to_all_rows():
+    rows = np.random.default_rng(0).normal([3.0, -100.0], [0.1, 20.0], (70, 2))
+    moments = Moments.none(2)
+    for batch in np.split(rows, [1, 1, 30]):  # one of them is empty
+        moments = moments.including(batch)
+    assert moments.count == 70
+    np.testing.assert_allclose(moments.mean, rows.mean(0))
+    np.testing.assert_allclose(moments.deviation, rows.std(0))
+
+
+def test_before_the_first_row_nothing_is_scaled():
+    moments = Moments.none(3)
+    np.testing.assert_array_equal(moments.mean, np.zeros(3))
+    np.testing.assert_array_equal(moments.deviation, np.ones(3))
