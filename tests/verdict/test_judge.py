@@ -20,7 +20,6 @@ from madoc.commands.answer import EXIT_CODES
 from madoc.identification.term_tests import MissingTerm
 from madoc.verdict import Word, judge
 from madoc.verdict.judge import beats_mid_range, explains_all
-from madoc.verdict.remedies import value_of
 
 
 def errors(one, twenty):
@@ -108,12 +107,6 @@ def test_a_certain_term_is_a_mismatch_though_it_hardly_moves_the_estimate():
     assert "the model lacks an offset of the sensor (signal_bias.hip): a value of 0.1 ± 0.01" in verdict.sentence
     assert "(t = 10), and would move mass by +0.001 from 1.2; a model with it explains the log" in verdict.sentence
     assert verdict.sentence.endswith("{field: signal_bias, element: hip, low: 0, high: 0.2}")
-
-
-def test_the_error_told_of_a_term_is_that_of_its_t():
-    """Of few windows a ratio of 20 is as likely by chance as a normal deviate of 8: 0.4 is told with 0.05, not 0.02."""
-    found = MissingTerm("drag", "dof_drag.hip", 0.5, 0.02, "1", 0.8, 8.0, {"mass": 0.1}, nominal=0.1)
-    assert value_of(found) == "0.5 ± 0.05 (the model has 0.1)"
 
 
 def test_an_end_of_a_range_is_told_beside_a_term_though_that_leaves_the_parameter_open():
