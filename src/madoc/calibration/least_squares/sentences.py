@@ -131,8 +131,8 @@ def about_residuals(problem: CalibrationProblem, search: SearchState) -> tuple[s
         return ()
     left_out, windows = _left_out(search)
     sentence = (
-        f"{left_out} of {windows} windows count for nothing: no initial state found explains them as "
-        "well as others, as where contacts begin, or their simulation failed"
+        f"windows left out: {left_out} of {windows}, as no initial state explains them as well as the others (contacts "
+        "that begin there, wrong readings) or their simulation failed"
     )
     return (*([sentence] if left_out else []), *([TAILS] if have_long_tails(problem, search) else []))
 
@@ -140,9 +140,9 @@ def about_residuals(problem: CalibrationProblem, search: SearchState) -> tuple[s
 def about_model_errors(horizon: int) -> str:
     """A sentence that longer windows leave more, which is for the verdict to judge: not every cause is the model's."""
     return (
-        f"over {horizon} control steps the simulator leaves more than noise: starts of windows were not found, "
-        "or the model lacks something that adds up (the verdict says whether its tests found any); the intervals are "
-        "those of the shortest windows"
+        f"over {horizon} control steps residuals exceed the noise: the model lacks something that adds up (the verdict "
+        "says whether its tests found what), or starts of windows were not found; the intervals are those of the "
+        "shortest windows"
     )
 
 
