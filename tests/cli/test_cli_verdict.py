@@ -80,6 +80,7 @@ def test_the_verdict_is_read_before_the_table(log, tmp_path, capsys):
     told = capsys.readouterr().out
     assert told.startswith("CALIBRATED: over ")
     assert told.index("CALIBRATED") < told.index("jnt_stiffness.slide") < told.index("auto took least-squares")
+    assert "what to do: use the model, within the intervals of its values" in told
 
 
 def test_a_bare_method_holds_out_where_asked_and_leaves_with_its_verdict(log, tmp_path, capsys):

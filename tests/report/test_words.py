@@ -2,7 +2,7 @@ import math
 
 import pytest
 
-from madoc.report.words import count, duration, memory, number, parameter_title, with_error
+from madoc.report.words import count, duration, memory, number, to_do, with_error
 
 
 @pytest.mark.parametrize(
@@ -40,21 +40,6 @@ def test_counts_keep_thousands_apart():
 
 
 @pytest.mark.parametrize(
-    ("name", "title"),
-    [
-        ("gravity", "gravity"),
-        ("body_mass.torso", "torso mass"),
-        ("dof_damping.left+right", "left+right damping"),
-        ("dof_drag.knee", "knee drag"),
-        ("knee_damping", "knee damping"),
-        ("left.knee", "left.knee"),
-    ],
-)
-def test_parameters_are_called_by_element_and_quantity(name, title):
-    assert parameter_title(name) == title
-
-
-@pytest.mark.parametrize(
     ("value", "error", "words"),
     [
         (-9.80642, 0.00122, "−9.8064 ± 0.0012"),
@@ -65,3 +50,12 @@ def test_parameters_are_called_by_element_and_quantity(name, title):
 )
 def test_an_error_has_two_digits_and_its_value_as_many_decimals(value, error, words):
     assert with_error(value, error) == words
+
+
+def test_a_search_that_had_not_settled_is_to_be_resumed_before_anything_else():
+    """Only `USABLE` has something better than itself; what the other words ask for does not depend on the search."""
+    assert "; better, find what the model lacks" in to_do("USABLE", settled=True)
+    resumed = to_do("USABLE", settled=False)
+    assert resumed.endswith("; better, resume the search with a larger budget (--resume, --budget)")
+    assert resumed.startswith("use the calibrated model in MuJoCo as it is") and "lacks" not in resumed
+    assert to_do("NO_IMPROVEMENT", settled=False) == to_do("NO_IMPROVEMENT", settled=True)

@@ -240,10 +240,13 @@ def _costs_table(name: str, costs: "Mapping[str, ErrorCost]") -> Table:
 
 
 def calibration_text(result: "CalibrationResult") -> tuple[RenderableType, ...]:
-    """The verdict, the tables of estimates and of predictions, and a summary."""
+    """The verdict, the tables of estimates and of predictions, a summary, and what to do."""
+    from madoc.report.words import to_do
+
     verdict = (str(result.verdict),) if result.verdict else ()
+    advice = (f"what to do: {to_do(result.verdict.word, settled=result.settled)}",) if result.verdict else ()
     predictions = result.predictions()
-    return (*verdict, result.table(), *(() if predictions is None else (predictions,)), result.summary())
+    return (*verdict, result.table(), *(() if predictions is None else (predictions,)), result.summary(), *advice)
 
 
 def calibration_status(result: "CalibrationResult") -> str:

@@ -21,7 +21,7 @@ from madoc.errors import MadocError, printable
 from madoc.report import words
 from madoc.report.reading import Run, read_run
 from madoc.report.sections import SECTIONS
-from madoc.report.words import TO_DO, TONES, count, duration, number, percent
+from madoc.report.words import TONES, count, duration, number, percent, to_do
 from madoc.runs.files import replacing
 
 GENERATOR = "madoc report"
@@ -39,7 +39,7 @@ def templates() -> jinja2.Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    names = ("number", "percent", "count", "duration", "spread", "spread_words", "place", "parameter_title")
+    names = ("number", "percent", "count", "duration", "spread", "spread_words", "place")
     environment.filters |= {name: getattr(words, name) for name in names}
     environment.filters |= {"unit": words.unit_words, "interval": words.interval_words}
     environment.globals |= {"TONES": words.TONES, "generator": GENERATOR}
@@ -126,7 +126,8 @@ def headline(run: Run) -> Headline:
         return Headline((run.status or "NOT ENDED").upper(), "doubtful", sentence, run.sentence)
     if run.result.verdict is not None:
         verdict, word = run.result.verdict, run.result.verdict.word
-        return Headline(word.replace("_", " "), TONES[word], verdict.sentence, run.sentence, TO_DO[word])
+        advice = to_do(word, settled=run.result.settled)
+        return Headline(word.replace("_", " "), TONES[word], verdict.sentence, run.sentence, advice)
     if run.result.status in _UNJUDGED:
         return Headline(run.result.status.upper(), *_UNJUDGED[run.result.status], run.sentence)
     sentence = "Nothing was held out, so this estimate was not tried on data it has not seen."
@@ -154,8 +155,8 @@ def _on_holdout(held: HoldOut) -> tuple[str, str, str]:
         return "classifier, simulated or logged", number(held.area_at_estimate.area, 2), note
     if held.ahead is not None:
         value, low, high = map(percent, (held.ahead.relative, *held.ahead.relative_interval))
-        ahead = f"over {number(held.ahead.seconds, 3)} s, but for signals that are noise alone"
-        note = f"of your model's as given, {ahead}; {low} to {high}"
+        ahead = f"over {number(held.ahead.seconds, 3)} s, of all signals that show more than noise"
+        note = f"of the error of your model as given, {ahead}; 95 % interval {low} to {high}"
         return "error on the hold-out", value, note
     value, low, high = map(percent, (held.score, *held.score_interval))
     return "error on the hold-out", value, f"of that at mid-range, over all times and signals; {low} to {high}"

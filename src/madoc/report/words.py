@@ -4,7 +4,6 @@ import math
 from collections.abc import Sequence
 
 from madoc.calibration.result import ParameterEstimate
-from madoc.parameters import FIELDS
 
 TONES = {
     "CALIBRATED": "good",
@@ -18,7 +17,7 @@ TONES = {
 TO_DO = {
     "CALIBRATED": "use the model, within the intervals of its values: madoc export writes it for other tools",
     "USABLE": "use the calibrated model in MuJoCo as it is, and do not take its values for the machine's own; better, "
-    "find what the model lacks, put it into the spec and calibrate again, or resume a search that had not settled",
+    "find what the model lacks, put it into the spec and calibrate again",
     "NO_IMPROVEMENT": "do what the sentence above says; else give it a larger budget (--budget), or try another "
     "method (--method)",
     "NOT_IDENTIFIABLE": "do what the sentence above says; else log motion that moves these parameters, or calibrate "
@@ -27,7 +26,15 @@ TO_DO = {
     "spec and the log; where it gives a line for the spec, add that line; then calibrate again",
     "DATA_REJECTED": "check the order of the rows, and which columns of the log the spec reads",
 }
-"""What to do first after each verdict."""
+"""What to do first after each verdict of a search that had settled."""
+_RESUME = "better, resume the search with a larger budget (--resume, --budget)"
+
+
+def to_do(word: str, *, settled: bool) -> str:
+    """What to do first after a verdict."""
+    first, _, then = TO_DO[word].partition("; better, ")
+    return f"{first}; {_RESUME}" if then and not settled else TO_DO[word]
+
 
 _METRIC_WORDS = {
     "residual": "residual; 1 is what a signal usually changes in a step",
@@ -38,15 +45,6 @@ _METRIC_WORDS = {
     "discriminator_loss_sas": "from (s, a, s′)",
 }
 """Words for metrics whose name would say less."""
-
-
-def parameter_title(name: str) -> str:
-    """`dof_damping.foot_joint` as `foot_joint damping`."""
-    field, _, element = name.partition(".")
-    if element and field not in FIELDS:
-        return name  # a label that a user gave
-    word = (field in FIELDS and FIELDS[field].words) or field.replace("_", " ")
-    return f"{element} {word}" if element else word
 
 
 def metric_title(name: str) -> str:
