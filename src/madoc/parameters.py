@@ -23,7 +23,6 @@ class Field:
         slide_unit: The unit for a slide joint, where it is another.
         minimum: Smallest value that is physically possible.
         maximum: Largest size of a value that any robot may have.
-        words: What reports call it; if empty, its name.
         missing: What a model lacks that has no such term, in words; empty where nobody looks for that.
         in_model: Whether the value is written into the MuJoCo model; if not, the simulator applies it around the model.
         of_all: Whether it may have no element, and is then one of the whole robot.
@@ -33,7 +32,6 @@ class Field:
     unit: str
     minimum: float = -np.inf
     slide_unit: str = ""
-    words: str = ""
     missing: str = ""
     maximum: float = 1e12
     in_model: bool = True
@@ -53,53 +51,53 @@ _DRAG = "drag that grows with the square of the speed"
 _ARMATURE = "inertia at the joint, as of a geared rotor"
 FIELDS: dict[str, Field] = {
     "gravity": Field(None, "m/s²", missing="another gravity", maximum=1e4),
-    "body_mass": Field("body", "kg", 0.0, words="mass", missing="another mass, as of a payload"),
-    "body_mass_and_inertia": Field("body", "kg", 0.0, words="mass and inertia"),
+    "body_mass": Field("body", "kg", 0.0, missing="another mass, as of a payload"),
+    "body_mass_and_inertia": Field("body", "kg", 0.0),
     "body_inertia": Field("body", "kg·m²", 0.0),
     "body_com": Field("body", "m", 0.0, missing="another centre of mass, as with a payload"),
-    "body_distance": Field("body", "m", 0.0, words="distance", missing="another length of the link before a body"),
-    "payload_mass": Field("body", "kg", 0.0, words="payload"),
-    **{f"payload_{axis}": Field("body", "m", words=f"payload's {axis}") for axis in "xyz"},
-    "payload_gyration": Field("body", "m", 0.0, words="payload's radius of gyration"),
-    **{field: Field("body", "1", maximum=3.0, words=field.replace("_", " ")) for field in INERTIA},
-    "dof_frictionloss": Field("joint", "N·m", 0.0, "N", "dry friction", "Coulomb friction"),
-    "dof_drag": Field("joint", "N·m·s²/rad²", 0.0, "N·s²/m²", "drag", _DRAG),
-    "dof_damping": Field("joint", "N·m·s/rad", 0.0, "N·s/m", "damping", "viscous damping"),
-    "dof_armature": Field("joint", "kg·m²", 0.0, "kg", "armature", _ARMATURE),
-    "jnt_stiffness": Field("joint", "N·m/rad", 0.0, "N/m", "stiffness", "a spring"),
-    "jnt_ref": Field("joint", "rad", slide_unit="m", words="zero"),
-    "geom_friction": Field("geom", "1", 0.0, words="friction", missing="another friction at contacts"),
-    "geom_friction_torsional": Field("geom", "m", 0.0, words="torsional friction"),
-    "geom_friction_rolling": Field("geom", "m", 0.0, words="rolling friction"),
-    "contact_time": Field("geom", "s", 0.0, words="time constant of contacts", missing="softer or harder contacts"),
-    "contact_damping": Field("geom", "1", 0.0, words="damping ratio of contacts"),
-    "actuator_gain": Field("actuator", "1", words="gain", missing="another gain of the actuator"),
-    "actuator_kv": Field("actuator", "N·m·s/rad", 0.0, "N·s/m", "servo damping"),
-    "drive_supply": Field("actuator", "V", 0.0, words="supply"),
-    "drive_kt": Field("actuator", "N·m/A", 0.0, words="kt"),
-    "drive_resistance": Field("actuator", "Ω", 1e-9, words="resistance"),
-    "drive_gain": Field("actuator", "1", 0.0, words="gain"),
-    "drive_damping_gain": Field("actuator", "1", 0.0, words="damping gain"),
-    "drive_duty_limit": Field("actuator", "1", 0.0, words="largest duty", maximum=1.0),
-    "drive_current_limit": Field("actuator", "A", 0.0, words="largest current"),
-    "drive_strength": Field("actuator", "1", 0.0, words="strength", missing="another strength of the drive"),
-    "drive_saturation": Field("actuator", "1/A", 0.0, words="saturation"),
-    "friction_stribeck": Field("joint", "N·m", 0.0, "N", "Stribeck friction"),
-    "friction_stribeck_speed": Field("joint", "rad/s", 1e-9, "m/s", "Stribeck speed"),
-    "friction_stribeck_exponent": Field("joint", "1", 0.0, words="Stribeck exponent", maximum=100.0),
+    "body_distance": Field("body", "m", 0.0, missing="another length of the link before a body"),
+    "payload_mass": Field("body", "kg", 0.0),
+    **{f"payload_{axis}": Field("body", "m") for axis in "xyz"},
+    "payload_gyration": Field("body", "m", 0.0),
+    **{field: Field("body", "1", maximum=3.0) for field in INERTIA},
+    "dof_frictionloss": Field("joint", "N·m", 0.0, "N", "Coulomb friction"),
+    "dof_drag": Field("joint", "N·m·s²/rad²", 0.0, "N·s²/m²", _DRAG),
+    "dof_damping": Field("joint", "N·m·s/rad", 0.0, "N·s/m", "viscous damping"),
+    "dof_armature": Field("joint", "kg·m²", 0.0, "kg", _ARMATURE),
+    "jnt_stiffness": Field("joint", "N·m/rad", 0.0, "N/m", "a spring"),
+    "jnt_ref": Field("joint", "rad", slide_unit="m"),
+    "geom_friction": Field("geom", "1", 0.0, missing="another friction at contacts"),
+    "geom_friction_torsional": Field("geom", "m", 0.0),
+    "geom_friction_rolling": Field("geom", "m", 0.0),
+    "contact_time": Field("geom", "s", 0.0, missing="softer or harder contacts"),
+    "contact_damping": Field("geom", "1", 0.0),
+    "actuator_gain": Field("actuator", "1", missing="another gain of the actuator"),
+    "actuator_kv": Field("actuator", "N·m·s/rad", 0.0, "N·s/m"),
+    "drive_supply": Field("actuator", "V", 0.0),
+    "drive_kt": Field("actuator", "N·m/A", 0.0),
+    "drive_resistance": Field("actuator", "Ω", 1e-9),
+    "drive_gain": Field("actuator", "1", 0.0),
+    "drive_damping_gain": Field("actuator", "1", 0.0),
+    "drive_duty_limit": Field("actuator", "1", 0.0, maximum=1.0),
+    "drive_current_limit": Field("actuator", "A", 0.0),
+    "drive_strength": Field("actuator", "1", 0.0, missing="another strength of the drive"),
+    "drive_saturation": Field("actuator", "1/A", 0.0),
+    "friction_stribeck": Field("joint", "N·m", 0.0, "N"),
+    "friction_stribeck_speed": Field("joint", "rad/s", 1e-9, "m/s"),
+    "friction_stribeck_exponent": Field("joint", "1", 0.0, maximum=100.0),
     **{
-        f"friction_{rest}load{side}": Field("joint", "1", 0.0, words=f"friction by {side[1:] or 'the'} load{at_rest}")
-        for rest, at_rest in (("", ""), ("stribeck_", " at rest"))
+        f"friction_{rest}load{side}": Field("joint", "1", 0.0)
+        for rest in ("", "stribeck_")
         for side in ("", "_motor", "_external")
     },
-    "friction_quadratic_motor": Field("joint", "1/(N·m)", 0.0, "1/N", "quadratic friction, motor"),
-    "friction_quadratic_external": Field("joint", "1/(N·m)", 0.0, "1/N", "quadratic friction, external"),
-    "gear_backlash": Field("joint", "rad", 0.0, "m", "backlash"),
-    "gear_stiffness": Field("joint", "N·m/rad", 0.0, "N/m", "stiffness of the gear"),
-    "gear_damping": Field("joint", "N·m·s/rad", 0.0, "N·s/m", "damping of the gear"),
-    "action_delay": Field("action", "s", 0.0, words="delay", maximum=10.0, in_model=False, of_all=True),
-    "action_lag": Field("action", "s", 0.0, words="lag", maximum=10.0, in_model=False, of_all=True),
-    "signal_bias": Field("signal", "1", words="bias", missing="an offset of the sensor", in_model=False),
+    "friction_quadratic_motor": Field("joint", "1/(N·m)", 0.0, "1/N"),
+    "friction_quadratic_external": Field("joint", "1/(N·m)", 0.0, "1/N"),
+    "gear_backlash": Field("joint", "rad", 0.0, "m"),
+    "gear_stiffness": Field("joint", "N·m/rad", 0.0, "N/m"),
+    "gear_damping": Field("joint", "N·m·s/rad", 0.0, "N·s/m"),
+    "action_delay": Field("action", "s", 0.0, maximum=10.0, in_model=False, of_all=True),
+    "action_lag": Field("action", "s", 0.0, maximum=10.0, in_model=False, of_all=True),
+    "signal_bias": Field("signal", "1", missing="an offset of the sensor", in_model=False),
 }
 """Every field a parameter can name.
 

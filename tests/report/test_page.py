@@ -46,7 +46,7 @@ def test_a_page_says_what_a_bare_run_lacks(bare):
 
 
 def test_an_estimate_stands_where_it_belongs_in_its_range(whole):
-    (row,) = [row for row in drawn(whole, "estimates").split('<div class="estimate ') if "<b>torso mass</b>" in row]
+    (row,) = [row for row in drawn(whole, "estimates").split('<div class="estimate ') if "<b>body_mass.torso</b>" in row]
     # 3.4 ± 0.1 of 3 to 5, the truth at 3.53
     assert 'class="mark" style="left:20.0%"' in row
     assert 'class="span" style="left:15.0%;width:10.0%"' in row
@@ -72,14 +72,14 @@ def test_the_error_that_costs_most_is_at_the_top(whole):
 
 
 def test_the_strongest_correlation_is_told(whole):
-    assert content(whole, "correlations")["strongest"] == ["leg mass and torso mass: −0.9"]
+    assert content(whole, "correlations")["strongest"] == ["body_mass.leg and body_mass.torso: −0.9"]
 
 
 def test_missing_terms_are_drawn_by_how_far_they_move_the_estimates(whole):
     friction, spring = content(whole, "lacks")["rows"]
-    assert (friction["width"], friction["certain"], friction["moves"]) == (100.0, True, "gravity by −2 half-widths")
+    assert (friction["width"], friction["certain"], friction["moves"]) == (100.0, True, "gravity by −0.4")
     assert (spring["width"], spring["certain"], spring["value"]) == (25.0, False, "1 ± 0.4 N·m/rad")
-    assert content(whole, "lacks")["alternatives"] == [("a spring (jnt_stiffness.hip)", "gravity 0.5 ± 0.4")]
+    assert content(whole, "lacks")["alternatives"] == [("a spring (jnt_stiffness.hip)", "gravity 0.1 ± 0.08")]
     assert "0.2 ± 0.02 N·m, <b>t = 10</b>" in drawn(whole, "lacks")
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from madoc.report.charts import Level, Line, line_chart, thinned
 from madoc.report.reading import MetricLog, Run
-from madoc.report.words import metric_title, parameter_title
+from madoc.report.words import metric_title
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def _trace_chart(run: Run, log: MetricLog, name: str, low: float, high: float, u
         y_range=(low, high),
         levels=[Level(run.truth[name], "truth")] if name in run.truth else [],
     )
-    return {"title": parameter_title(name), "unit": unit, "chart": chart}
+    return {"title": name, "unit": unit, "chart": chart}
 
 
 def _ranges(run: Run) -> dict[str, tuple[float, float, str]]:

@@ -5,11 +5,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
+from madoc.calibration.holdout import HoldOut
 from madoc.identification.combinations import Combination
 from madoc.identification.term_tests import Alternative, MissingTerm
 from madoc.report.charts import matrix_chart, scatter_chart
 from madoc.report.reading import Run
-from madoc.report.words import interval_words, number, parameter_title, percent, unit_words, with_error
+from madoc.report.words import interval_words, number, percent, unit_words, with_error
 from madoc.verdict.adequacy import CERTAIN, is_certain, numerical
 
 
@@ -33,7 +34,7 @@ def grouping(run: Run) -> dict[str, object] | str:
     points, shares = plane_of(embeddings.vectors)
     chart = scatter_chart(
         points,
-        [parameter_title(name) for name in embeddings.names],
+        list(embeddings.names),
         [run.colour(name) for name in embeddings.names],
         label="parameters in the plane of their embeddings",
         titles=(f"first component, {100 * shares[0]:.0f} % of the variance", f"second, {100 * shares[1]:.0f} %"),
@@ -68,7 +69,7 @@ def correlations(run: Run) -> dict[str, object] | str:
         return "The estimates have no spread, so none hang together."
     deviation = np.sqrt(np.diag(covariance)[kept])
     matrix = covariance[np.ix_(kept, kept)] / np.outer(deviation, deviation)
-    titles = [parameter_title(names[index]) for index in kept]
+    titles = [names[index] for index in kept]
     pairs = [
         (abs(float(matrix[row, column])), titles[row], titles[column], float(matrix[row, column]))
         for row in range(len(kept))
@@ -90,30 +91,30 @@ def lacks(run: Run) -> dict[str, object] | str:
     if not held.missing_terms and not held.alternatives:
         return "No missing term was found, or the log does not tell the robot's states well enough to look for one."
     largest = max((_largest(term) for term in held.missing_terms), default=0.0)
-    rows = [_row(term, largest, run.units) for term in held.missing_terms]
+    rows = [_row(term, largest, held, run.units) for term in held.missing_terms]
     causes = [term.cause for term in held.missing_terms]
     for at, cause in enumerate(causes):
         if causes.count(cause) > 1:
             rows[at]["cause"] = f"{cause}, shape {1 + causes[:at].count(cause)}"
-    alternatives = [_words(each) for each in held.alternatives]
+    alternatives = [_words(each, held) for each in held.alternatives]
     told = {"largest": number(largest, 2), "certain": number(CERTAIN)}
     none_certain = bool(rows) and numerical(held) is None and not any(map(is_certain, held.missing_terms))
     return {"rows": rows, "alternatives": alternatives, "none_certain": none_certain} | told
 
 
-def _row(term: MissingTerm, largest: float, units: Mapping[str, str]) -> dict[str, object]:
+def _row(term: MissingTerm, largest: float, held: HoldOut, units: Mapping[str, str]) -> dict[str, object]:
     """A term as its bar shows it: the largest shift of a parameter, relative to the largest of all terms."""
     name = max(term.shifts, key=lambda each: abs(term.shifts[each]))
     field, _, element = term.parameter.partition(".")
     unit = units.get(element, "") if field == "signal_bias" else unit_words(term.unit)
-    value = f"{with_error(term.value, term.standard_error)} {unit}".rstrip()
+    value = f"{with_error(term.value, term.error)} {unit}".rstrip()
     return {
         "cause": term.cause,
         "parameter": term.parameter,
         "value": value,
         "t": number(term.t, 3),
         "explained": percent(term.explained),
-        "moves": f"{parameter_title(name)} by {number(term.shifts[name], 2)} half-widths",
+        "moves": f"{name} by {number(term.shifts[name] * held.values[name][1], 2)}",
         "width": round(100.0 * _largest(term) / largest, 2) if largest else 0.0,
         "certain": is_certain(term),
     }
@@ -123,10 +124,13 @@ def _largest(term: MissingTerm) -> float:
     return max(map(abs, term.shifts.values()), default=0.0)
 
 
-def _words(each: Alternative) -> tuple[str, str]:
+def _words(each: Alternative, held: HoldOut) -> tuple[str, str]:
     """What an alternative rests on, and how it moves the parameters."""
     moved = sorted(each.shifts, key=lambda name: -abs(each.shifts[name]))[:3]
-    shifts = (f"{parameter_title(n)} {with_error(each.shifts[n], each.errors[n])}" for n in moved)
+    halves = {name: held.values[name][1] for name in moved}
+    shifts = (
+        f"{name} {with_error(half * each.shifts[name], half * each.errors[name])}" for name, half in halves.items()
+    )
     return ", ".join(each.causes), ", ".join(shifts)
 
 
@@ -134,7 +138,7 @@ def together(run: Run) -> dict[str, object] | str:
     """Sums and products of parameters that the log tells though it leaves each of them open."""
     told: Sequence[Combination] = run.result.combinations if run.result else ()
     if not told:
-        return "No parameters had to be combined: the log tells each by itself, or it tells nothing of those left open."
+        return "No sums or products of parameters are told: the log leaves no parameters open that it tells together."
     rows = [
         (each.name, f"{number(each.estimate)} {each.unit}".rstrip(), interval_words(each.interval)) for each in told
     ]

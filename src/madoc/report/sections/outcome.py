@@ -81,8 +81,10 @@ def robustness(run: Run) -> dict[str, object] | str:
 def motion(run: Run) -> dict[str, object] | str:
     """A held-out run, measured over simulated."""
     seen = read_film(run.folder / "motion.npz")
-    if seen is None or run.evidence is None:
-        return "No film was made: no held-out run could be replayed, or the robot has no shape."
+    if run.evidence is None or run.evidence.after is None:
+        return "No film was made: no held-out run could be replayed from a known or fitted state."
+    if seen is None:
+        return "No film was made: nothing of the model can be drawn, or its pictures could not be made."
     whole = np.isfinite(run.evidence.measured).all(-1).sum(1)
     longest, shown = float(run.evidence.time[whole.max() - 1]), float(seen.time[-1])
     cut = shown if shown < longest - 1e-9 else None
