@@ -248,7 +248,8 @@ def test_findings_go_with_a_calibration(robot, columns, tmp_path):
         dataset, findings=(*found, Finding("warning", "it squeaks", "elbow", "oil it"), Finding("note", "x"))
     )
     (scale,) = (finding.sentence for finding in found if finding.where == "scale")  # what masses rest on is kept too
-    assert CalibrationProblem(told, simulator).doubts == (scale, "elbow: it squeaks; oil it")
+    problem = CalibrationProblem(told, simulator)
+    assert (problem.notes, problem.doubts) == ((scale,), ("elbow: it squeaks; oil it",))
 
 
 def test_a_parameter_that_matters_only_where_the_log_was_is_not_refused(tmp_path):

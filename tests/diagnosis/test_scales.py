@@ -26,7 +26,7 @@ SCALED = (
 PLACE, RATIOS, MASSES = (
     "check one distance with a ruler",
     "only ratios can be found",
-    "a gear and all masses scaled alike",
+    "no log can show whether masses and forces are right together",
 )
 
 

@@ -46,7 +46,9 @@ def test_a_page_says_what_a_bare_run_lacks(bare):
 
 
 def test_an_estimate_stands_where_it_belongs_in_its_range(whole):
-    (row,) = [row for row in drawn(whole, "estimates").split('<div class="estimate ') if "<b>body_mass.torso</b>" in row]
+    (row,) = [
+        row for row in drawn(whole, "estimates").split('<div class="estimate ') if "<b>body_mass.torso</b>" in row
+    ]
     # 3.4 ± 0.1 of 3 to 5, the truth at 3.53
     assert 'class="mark" style="left:20.0%"' in row
     assert 'class="span" style="left:15.0%;width:10.0%"' in row

@@ -88,8 +88,13 @@ class CalibrationProblem:
             "the estimate will be biased by the difference"
         )
         gaps = () if recorded in ("unknown", simulated) else (gap,)
-        findings = (finding.sentence for finding in self.dataset.findings if finding.level == "warning" or finding.kept)
-        return (*gaps, *self.dataset.disturbance.sentences(), *findings)
+        warnings = (finding.sentence for finding in self.dataset.findings if finding.level == "warning")
+        return (*gaps, *self.dataset.disturbance.sentences(), *warnings)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What bears on the meaning of any estimate, one sentence each."""
+        return tuple(finding.sentence for finding in self.dataset.findings if finding.kept)
 
     def require_pairs(self) -> None:
         """Raise MadocError for data whose next observations are shuffled."""

@@ -92,7 +92,7 @@ def calibrate(
         groups=[[space.names[index] for index in group] for group in estimate.groups or [range(len(space))]],
         parameters=_parameters(problem.simulator.task, estimate),
         warnings=without_repeats(warnings, problem.doubts),
-        notes=list(estimate.notes),
+        notes=[*estimate.notes, *problem.notes],
         error=None if true_values is None else calibration_error(estimate.mean, true_values, space),
         covariance=None if estimate.covariance is None else estimate.covariance.tolist(),
         combinations=[] if told is None else list(combinations(space, estimate.mean, told, estimate.quantile)),

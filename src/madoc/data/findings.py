@@ -21,7 +21,7 @@ class Finding:
         late: How late actions seem to take effect, s, where that is the finding; tests at an estimate may exclude it.
         rough: Whether it is a size that the log alone tells roughly, so that an estimate may refute it.
         of_rows: Whether it says how far apart rows are; an estimate whose own motion says the same refutes it.
-        kept: Whether a note is kept with results as a warning is, as it bears on what estimates mean.
+        kept: Whether a note is kept with results, as it bears on what estimates mean.
     """
 
     level: Level

@@ -65,10 +65,12 @@ def _scale_of_masses(names: list[str], *, only_ratios: bool) -> Finding:
         )
         return Finding("warning", what, "parameters", "take one of them out of the spec, at a value that was measured")
     what = (
-        f"no log can show a gear and all masses scaled alike: {listed(names)} are found in proportion to the "
-        "masses and gains that the model takes as known"
+        "no log can show whether masses and forces are right together: were the drives' gains and the masses that the "
+        f"model keeps all 10 % off, {listed(names)} would be 10 % off as well, and no interval counts that"
     )
-    return Finding("note", what, "scale", "weigh a part, or measure a torque, and put that into the model", kept=True)
+    return Finding(
+        "note", what, "scale", "weigh a part, or measure a drive's torque, and put that into the model", kept=True
+    )
 
 
 def range_findings(dataset: Dataset, simulator: Simulator) -> list[Finding]:
