@@ -20,7 +20,6 @@ from paper_cells import planned
 from madoc import tasks
 from madoc.report.reading import read_arrays
 from madoc.report.sections.estimates import plane_of
-from madoc.report.words import parameter_title
 from madoc.simulation.pictures import outlines
 from madoc.simulation.write import find_elements
 from madoc.tasks import Task
@@ -92,7 +91,7 @@ def _drawn(task: Task, found: Mapping) -> str:
     points, shares = plane_of(np.array(found["vectors"]))
     chart = scatter_chart(
         points,
-        [parameter_title(name) for name in found["names"]],
+        [_title(name) for name in found["names"]],
         [colour[name] for name in found["names"]],
         titles=(f"first component, {100 * shares[0]:.0f} % of the variance", f"second, {100 * shares[1]:.0f} %"),
         width=PLANE,
@@ -125,7 +124,7 @@ def robot(task: Task, colours: Mapping[str, str]) -> str:
         places = {"body_mass": data.xipos, "dof_damping": data.xanchor}
         at = origin + scale * places[parameter.field][element][[0, 2]] * [1, -1] if element >= 0 else GRAVITY
         side = -1 if parameter.field == "dof_damping" else 1
-        drawn.append(_point(at, parameter_title(parameter.name), colours[parameter.name], side))
+        drawn.append(_point(at, _title(parameter.name), colours[parameter.name], side))
     return "".join(drawn)
 
 
@@ -138,6 +137,12 @@ def _limb(first: Float[np.ndarray, " 2"], last: Float[np.ndarray, " 2"], *, widt
         f'{name}="{value:.1f}"' for name, value in zip(("x1", "y1", "x2", "y2"), (*first, *last), strict=True)
     )
     return f'<line class="limb" {ends} stroke-width="{width:.1f}"/>\n'
+
+
+def _title(name: str) -> str:
+    """`dof_damping.foot_joint` as `foot_joint damping`, which is short enough for a picture."""
+    field, _, element = name.partition(".")
+    return f"{element} {field.partition('_')[2]}" if element else field
 
 
 def _point(at: Float[np.ndarray, " 2"], name: str, colour: str, side: int) -> str:

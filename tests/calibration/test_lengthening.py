@@ -204,7 +204,7 @@ def test_what_the_model_does_wrong_ends_them_at_the_first_longer_ones(pendulum, 
     state, _ = ended(LeastSquares(), problem)
     assert state.best == LONGER
     warnings = LeastSquares().estimate(problem, state).warnings
-    assert any("the simulator leaves more than noise" in warning for warning in warnings)
+    assert any("residuals exceed the noise" in warning for warning in warnings)
 
 
 def test_the_longest_windows_begin_where_shorter_ones_do(pendulum):
