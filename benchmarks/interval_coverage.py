@@ -65,7 +65,7 @@ def solve(cases: Sequence[str], seed: int) -> dict:
         "case": case.key,
         "seconds": round(time.monotonic() - started, 1),
         "verdict": (result.get("verdict") or {}).get("word", "REFUSED"),
-        "widened": any("intervals were widened" in warning for warning in result.get("warnings", [])),
+        "widened": any("95 % intervals are wider than" in warning for warning in result.get("warnings", [])),
         "parameters": {
             name: compared(result.get("parameters", {}).get(name, {}), truth) for name, truth in problem.truth.items()
         },
