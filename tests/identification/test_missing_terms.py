@@ -308,6 +308,28 @@ def test_terms_beside_the_error_of_the_integration_step_are_not_fitted_without_i
     assert sorted(chosen) == [0, 1] and terms._beside_steps(tests, chosen) is not fits
 
 
+@pytest.mark.parametrize(("value", "taken"), [(1.0, True), (-1.0, False), (2.0, False)])
+def test_the_error_of_the_steps_is_taken_away_if_its_value_is_one_that_it_can_have(value, taken):
+    """Drag explains what the error of the steps leaves, and its share is one of all residuals."""
+    by_value, by_step, by_term = np.random.default_rng(0).standard_normal((3, 40, 8))
+    noise = 0.01 * np.random.default_rng(1).standard_normal((40, 8))
+    residuals = noise - value * by_step - 0.5 * by_term
+    products = Products.of(residuals, by_value[..., None], np.stack([by_term, by_step], axis=-1))
+    tried = (Candidate("drag", "dof_drag.hinge", "N", 0.0, 1.0, 0.0), Candidate(INTEGRATION, "", "", 0.0, 1.0, -np.inf))
+    tests = TermTests(
+        products, tried, ParameterSpace((Parameter("gravity", "", -11, -9),)), np.full(1, 1e-3), np.zeros(40, int)
+    )
+    steps, left = tests.steps()
+    drag, step = terms._terms(tests)
+    assert steps == [1] * taken and step.value == pytest.approx(value, abs=0.15)
+    if taken:
+        assert left == pytest.approx(1.0 - step.explained)
+        assert drag.value == pytest.approx(0.5, abs=0.01)
+        assert drag.explained == pytest.approx(left, abs=0.01)  # noise leaves nearly nothing
+    else:
+        assert left == 1.0 and drag.explained < 0.5
+
+
 @pytest.mark.parametrize("beside", [True, False])
 def test_a_log_of_a_finer_simulation_has_no_refit_that_ignores_the_steps(tmp_path, monkeypatch, beside):
     task = robots.load(write_robot(tmp_path, SPRING_SPEC)).task

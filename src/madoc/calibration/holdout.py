@@ -171,8 +171,6 @@ class Judged:
         contradictions: Sentences of the check of the log that contradict the spec, such as actions that come late.
         coarseness: By how many typical changes predictions one stride ahead change where the model is integrated in
             steps of a quarter of the length, the median over signals; 0 for a robot without a spec.
-        finer: Whether other terms than the error of the integration step were tested with steps of a quarter of the
-            length, as that error explains much and would hide them.
         open_loop: Errors of open-loop predictions in the signals' units, the shortest first; none without states.
         concentration: Where in the log that was calibrated to most of what the model leaves unexplained is; None where
             that was not looked for or no place stands out.
@@ -197,7 +195,6 @@ class Judged:
     open_at_end: tuple[str, ...] = ()
     contradictions: tuple[str, ...] = ()
     coarseness: float = 0.0
-    finer: bool = False
     open_loop: tuple[OpenLoop, ...] = ()
     concentration: Concentration | None = None
 

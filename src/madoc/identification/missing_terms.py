@@ -186,18 +186,14 @@ def _beside_steps(tests: TermTests, chosen: list[int]) -> bool:
 
 
 def _terms(tests: TermTests) -> Iterator[MissingTerm]:
-    """The score test of every candidate whose value is physical.
-
-    If the error of the integration step is significant, it is taken away before the others are tested.
-    """
-    beside: list[int] = []
-    for index in sorted(range(len(tests.tried)), key=lambda index: tests.tried[index].cause != INTEGRATION):
-        candidate, found = tests.tried[index], tests.score(index, beside)
-        if found is None:
-            continue
-        if candidate.cause == INTEGRATION and abs(found.t) >= SUSPICIOUS:
-            beside = [index]
-        yield term_of(candidate, found, tests.by_name(found.shifts))
+    """The score test of every candidate whose value is physical; the error of the integration step is taken away."""
+    steps, left = tests.steps()
+    for index, candidate in enumerate(tests.tried):
+        beside = [each for each in steps if each != index]
+        found = tests.score(index, beside)
+        if found is not None:
+            found = replace(found, explained=left * found.explained) if beside else found
+            yield term_of(candidate, found, tests.by_name(found.shifts))
 
 
 def _below_minimum(tests: TermTests, led: Float[np.ndarray, " d"]) -> Iterator[MissingTerm]:

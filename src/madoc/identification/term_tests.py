@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from madoc.identification.candidate_terms import DELAY, EARLY, UNLISTED, Candidate
+from madoc.identification.candidate_terms import DELAY, EARLY, INTEGRATION, UNLISTED, Candidate, of_steps
 from madoc.identification.concentration import Concentration
 from madoc.identification.score_tests import Products, Score, imitators, score
 from madoc.parameters import ParameterSpace
@@ -147,6 +147,17 @@ class TermTests:
         found, candidate = score(self.products, first + index, [first + other for other in beside]), self.tried[index]
         below = found is not None and candidate.nominal + found.change * candidate.reference < candidate.least
         return None if below else found
+
+    def steps(self) -> tuple[list[int], float]:
+        """The error of the integration step if it is significant, and the share of squared residuals beside it.
+
+        A value that it cannot have is of something else, which the tests of other terms are to find.
+        """
+        for index, candidate in enumerate(self.tried):
+            if candidate.cause == INTEGRATION and (found := self.score(index)) is not None:
+                taken = abs(found.t) >= SUSPICIOUS and of_steps(found.change)
+                return ([index], max(0.0, 1.0 - found.explained)) if taken else ([], 1.0)
+        return [], 1.0
 
     def by_name(self, values: Float[np.ndarray, " d"]) -> dict[str, float]:
         """Values in [-1, 1] of each parameter, by name and in half-widths; no estimate leaves its range by more."""

@@ -20,7 +20,7 @@ from madoc.identification.body_forces import (
     free_bodies,
     of_all_drives,
 )
-from madoc.identification.candidate_terms import INTEGRATION, UNLISTED
+from madoc.identification.candidate_terms import UNLISTED
 from madoc.identification.fitted_windows import Fit, reduced_of
 from madoc.identification.information import NORMAL_95
 from madoc.identification.replay import Readings
@@ -116,8 +116,7 @@ def unlisted_forces(
         by_terms: Derivatives of the residuals by the listed terms.
         responses: What small forces do to the windows.
     """
-    steps = [index for index, each in enumerate(tests.tried) if each.cause == INTEGRATION]
-    steps = [index for index in steps if (step := tests.score(index)) is not None and abs(step.t) >= SUSPICIOUS]
+    steps, left = tests.steps()
     terms, others, every = list[MissingTerm](), list[Alternative](), list(families)
     first, beside = 1 + tests.products.count, by_terms[..., steps]
     listed = replace(fit.slopes, by_parameters=np.concatenate([fit.slopes.by_parameters, beside], axis=-1))
@@ -137,7 +136,9 @@ def unlisted_forces(
         growing = f"grows most with {quantity}" if quantity != CONSTANT else "is about constant"
         cause = f"{UNLISTED} ({family.place}), which {growing}"
         least = np.sign(found.shifts) * np.maximum(np.abs(found.shifts) - NORMAL_95 * found.errors, 0.0)
-        terms.append(MissingTerm(cause, "", size, size / t, family.unit, found.explained, t, tests.by_name(least)))
+        terms.append(
+            MissingTerm(cause, "", size, size / t, family.unit, left * found.explained, t, tests.by_name(least))
+        )
         if t >= LIKELY_FORCE:
             others.append(tests.alternative((cause,), found.shifts, NORMAL_95 * found.errors))
     return terms, others

@@ -31,8 +31,6 @@ SMALLEST = 0.3
 """Smallest value of the error of the integration step in proportion to which its effects are taken larger."""
 NUMERICAL = 0.3
 """Share of squared residuals explained by the integration step; above it they are no mismatch of the model."""
-FELT = 0.1
-"""Share of squared residuals explained by the integration step, above which other terms are tested with a finer one."""
 IN_TIME = 0.25
 """Delay of actions in control steps; a shorter one is none."""
 SURELY = 3.0
@@ -45,9 +43,9 @@ HALF = 0.5
 """Share explained by a listed term over that of forces that are not listed, from which these are not named."""
 WORTH_NAMING = 0.02
 """Share in [0, 1] of the squared residuals that a term must explain to be named as what the model lacks."""
-NOT_REMOVED = 0.2
-"""Share in [0, 1] of what the integration step's error explains that a step of a quarter may still leave; it is more
-than a ninth where friction begins to hold a joint, or a contact begins."""
+NOT_REMOVED = 0.5
+"""Share in [0, 1] of what the integration step's error explains, up to which another term may be what is left of it: at
+contacts derivatives follow only a part of that error."""
 SURER = 1.314
 """Half of a 99 % interval over half of a 95 % interval: an alternative is covered unless one in a hundred is worse."""
 NAMED = 3
@@ -60,41 +58,23 @@ def missing_term(holdout: Judged, least: float | None = None) -> MissingTerm | N
     One that moves nothing counts too: what it would move is known to first order, at an estimate that may be wrong.
     A force or a value that explains less than a share `least` of the squared residuals does not, `worth_naming` by
     default: where errors are those of noise, intervals cover the estimate with it, and where they are far beyond noise
-    something else makes them. None where the error of the integration step explains much of the residuals and lesser
-    ones were not tested without.
+    something else makes them.
     """
-    if least is None:
-        least = worth_naming(integration(holdout.missing_terms) if holdout.finer else None)
-    if numerical(holdout) is not None and not holdout.finer:
-        return None
+    least = worth_naming(holdout.missing_terms) if least is None else least
     certain = [term for term in holdout.missing_terms if is_certain(term) and not _is_small(term, least)]
     moving = [term for term in certain if max(map(abs, term.shifts.values())) >= MOVES]
     return likeliest(moving or certain)
 
 
-def worth_naming(removed: MissingTerm | None = None) -> float:
-    """Share in [0, 1] of the squared residuals from which a term is named.
-
-    It is larger where the error of the integration step was `removed` by one of a quarter of the length: an integrator
-    of first order still has a quarter of its error then, a third of what was removed, whose square is a ninth.
-    """
-    return WORTH_NAMING if removed is None else max(WORTH_NAMING, NOT_REMOVED * removed.explained)
+def worth_naming(terms: Sequence[MissingTerm]) -> float:
+    """Share in [0, 1] of the squared residuals from which a term is named, and is not what the timestep's error leaves."""
+    step = integration(terms)
+    return WORTH_NAMING if step is None or step.t < SUSPICIOUS else max(WORTH_NAMING, NOT_REMOVED * step.explained)
 
 
-def may_be_left(holdout: HoldOut) -> float:
-    """Share of the squared residuals below which a finer timestep may leave a term of the numerical error.
-
-    It is 0 where terms were tested with the model's own timestep.
-    """
-    if not holdout.finer:
-        return 0.0
-    removed = integration(holdout.missing_terms)
-    return np.inf if removed is None else NOT_REMOVED * removed.explained
-
-
-def of_small_terms(terms: Sequence[MissingTerm], least: float = WORTH_NAMING) -> tuple[Alternative, ...]:
-    """The estimate with each term that is certain and explains less than a share `least`, for intervals to cover."""
-    small = [term for term in terms if is_certain(term) and _is_small(term, least)]
+def of_small_terms(terms: Sequence[MissingTerm]) -> tuple[Alternative, ...]:
+    """The estimate with each term that is certain and explains too little to be named, for intervals to cover."""
+    small = [term for term in terms if is_certain(term) and _is_small(term, worth_naming(terms))]
     return tuple(
         Alternative(
             (named(term),),
@@ -183,12 +163,13 @@ def is_certain(term: MissingTerm) -> bool:
     return term.cause != INTEGRATION and abs(term.t) >= (CERTAIN_DRIFT if is_change(term.cause) else CERTAIN)
 
 
-def numerical(holdout: Judged) -> MissingTerm | None:
+def numerical(terms: Sequence[MissingTerm]) -> MissingTerm | None:
     """The error of the integration step, where it explains much of the residuals, and no certain term explains more."""
-    step = integration(holdout.missing_terms)
-    # What terms explain with a finer step is a share of what the error of the model's own leaves.
-    left = 1.0 - step.explained if holdout.finer and step is not None else 1.0
-    return _numerical(holdout.missing_terms, left)
+    step = integration(terms)
+    if step is None or step.t < CERTAIN_STEP or step.explained < NUMERICAL:
+        return None
+    others = (each.explained for each in terms if is_certain(each) and not is_change(each.cause))
+    return step if max(others, default=0.0) <= step.explained else None
 
 
 def actions_in_time(terms: Sequence[MissingTerm], control_step: float) -> bool:
@@ -199,32 +180,6 @@ def actions_in_time(terms: Sequence[MissingTerm], control_step: float) -> bool:
     delays = [abs(term.value) + SURELY * term.standard_error for term in terms if term.cause in (DELAY, EARLY)]
     late = any(is_late(term.cause) and term.t >= SUSPICIOUS and term.value >= IN_TIME * control_step for term in terms)
     return bool(delays) and bool(max(delays) < IN_TIME * control_step) and not late
-
-
-def felt(terms: Sequence[MissingTerm]) -> MissingTerm | None:
-    """The error of the integration step, where it explains so much of the residuals that it may hide other terms."""
-    step = integration(terms)
-    return step if step is not None and step.t >= CERTAIN_STEP and step.explained >= FELT else None
-
-
-def to_remove(terms: Sequence[MissingTerm]) -> MissingTerm | None:
-    """The error of the integration step, where other terms are to be tested without it.
-
-    It is `felt`, or it may be what a certain term seems to be, as it explains at least as much as any of them.
-    """
-    step, certain = integration(terms), [each for each in terms if is_certain(each) and not is_change(each.cause)]
-    most = max((each.explained for each in certain), default=np.inf)
-    may_be_it = step is not None and step.t >= SUSPICIOUS and step.explained >= max(WORTH_NAMING, most)
-    return step if may_be_it else felt(terms)
-
-
-def _numerical(terms: Sequence[MissingTerm], left: float = 1.0) -> MissingTerm | None:
-    """`numerical`, where other terms explain shares of what is `left` of the squared residuals, in [0, 1]."""
-    step = integration(terms)
-    if step is None or step.t < CERTAIN_STEP or step.explained < NUMERICAL:
-        return None
-    others = (left * each.explained for each in terms if is_certain(each) and not is_change(each.cause))
-    return step if max(others, default=0.0) <= step.explained else None
 
 
 def integration(terms: Sequence[MissingTerm]) -> MissingTerm | None:
@@ -242,7 +197,7 @@ def in_full(alternatives: tuple[Alternative, ...], terms: Sequence[MissingTerm])
     Where motion is smooth its value is about 1. At contacts it comes out smaller, as derivatives do not follow jumps,
     and other estimates that rest on it, alone or with other terms, or on windows of another length, move in proportion.
     """
-    step = _numerical(terms)
+    step = numerical(terms)
     if step is None or step.value >= 1.0:
         return alternatives
     factor = 1.0 / max(step.value, SMALLEST)

@@ -14,7 +14,7 @@ from madoc.identification.combinations import Combination
 from madoc.identification.information import OPEN
 from madoc.identification.missing_terms import OTHER_WINDOWS
 from madoc.identification.term_tests import named
-from madoc.verdict.adequacy import is_certain, may_be_left, numerical
+from madoc.verdict.adequacy import is_certain, numerical
 from madoc.verdict.mismatch import (
     BEYOND_RANDOM,
     SEPARABLE,
@@ -89,7 +89,7 @@ def judge(
         or _untested(holdout)
         or _beyond_noise_later(holdout)
         or _small_but_certain(holdout)
-        or (_not_certain(holdout, EFFECTIVE) if effective and numerical(holdout) is None else None)
+        or (_not_certain(holdout, EFFECTIVE) if effective and numerical(holdout.missing_terms) is None else None)
         or Verdict("CALIBRATED", f"{_how_good(holdout)}, and {_how_sure(holdout)}")
     )
 
@@ -143,7 +143,8 @@ def explains_all(holdout: HoldOut) -> bool:
     """Whether an estimate's errors on the hold-out are no larger than those of noise alone, at every horizon."""
     if isinstance(holdout, ToldApart):
         return holdout.area_at_estimate.interval[0] <= 0.5
-    return numerical(holdout) is not None or not beyond_noise(holdout.errors.estimate, holdout.errors.noise)
+    noise_alone = not beyond_noise(holdout.errors.estimate, holdout.errors.noise)
+    return noise_alone or numerical(holdout.missing_terms) is not None
 
 
 def beats_mid_range(holdout: HoldOut) -> bool:
@@ -207,7 +208,7 @@ def _beyond_noise_later(holdout: HoldOut) -> Verdict | None:
         for name, ratio in each.beside_noise.items()
         if each.windows >= FEWEST_GROUPS and ratio > (ABOVE_NOISE if each.whole else BEYOND_RANDOM)
     ]
-    if not beside or numerical(holdout) is not None:
+    if not beside or numerical(holdout.missing_terms) is not None:
         return None
     ratio, name, seconds = max(beside)
     return _not_certain(
@@ -221,12 +222,10 @@ def _beyond_noise_later(holdout: HoldOut) -> Verdict | None:
 def _small_but_certain(holdout: HoldOut) -> Verdict | None:
     """What is certainly missing, though it explains too little of the residuals to be named as the cause.
 
-    Parameters may have made up for more of it than is left. With a finer timestep a certain term may be what is left of
-    the numerical error (`may_be_left`), and intervals cover it.
+    Parameters may have made up for more of it than is left.
     """
-    least = max(LEAST_EXPLAINED, may_be_left(holdout))
-    small = [term for term in holdout.missing_terms if is_certain(term) and term.explained >= least]
-    if not small or numerical(holdout) is not None:
+    small = [term for term in holdout.missing_terms if is_certain(term) and term.explained >= LEAST_EXPLAINED]
+    if not small or numerical(holdout.missing_terms) is not None:
         return None
     clearest = max(small, key=lambda term: abs(term.t))
     return _not_certain(

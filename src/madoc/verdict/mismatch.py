@@ -30,7 +30,7 @@ def lacking(holdout: HoldOut, *, settled: bool, unlike_noise: bool) -> Verdict |
     """
     holdout = holdout if settled else replace(holdout, at_end=())
     found = _missing(holdout, missing_term(holdout)) or _mismatch(holdout)
-    if far_beyond_noise(holdout) and numerical(holdout) is None:
+    if far_beyond_noise(holdout) and numerical(holdout.missing_terms) is None:
         found = found or _missing(holdout, missing_term(holdout, least=0.0))
     found = found or _outside(holdout)
     return found or (_unlike_noise(holdout) if unlike_noise else None)
@@ -149,7 +149,7 @@ def _outside(holdout: HoldOut) -> Verdict | None:
 
 def _unlike_noise(holdout: HoldOut) -> Verdict | None:
     """Residuals unlike noise, where the error of the integration step does not explain them."""
-    if numerical(holdout) is not None:
+    if numerical(holdout.missing_terms) is not None:
         return None
     return Verdict(
         "MODEL_MISMATCH",
@@ -162,7 +162,7 @@ def _unlike_noise(holdout: HoldOut) -> Verdict | None:
 
 
 def _mismatch(holdout: HoldOut) -> Verdict | None:
-    if numerical(holdout) is not None:
+    if numerical(holdout.missing_terms) is not None:
         return None
     if isinstance(holdout, ToldApart):
         sentence = _separable(holdout)

@@ -9,13 +9,11 @@ from typing import TypeVar
 import numpy as np
 from jaxtyping import Float
 
-from madoc import simulation
 from madoc.calibration.holdout import AgainstChance, Judged, RicherModel
 from madoc.data.findings import Finding
 from madoc.diagnosis.exchanged_columns import exchanged_columns
 from madoc.diagnosis.scales import coarseness
 from madoc.diagnosis.speeds import rates_contradict
-from madoc.identification.candidate_effects import FINER
 from madoc.identification.candidate_terms import DELAY, INTEGRATION, LAG
 from madoc.identification.excitation import WINDOWS, expected_half_widths
 from madoc.identification.fitted_windows import SHORTER, windows_of
@@ -25,17 +23,13 @@ from madoc.identification.term_tests import Alternative, MissingTerm, Suspicions
 from madoc.identification.windows import horizons
 from madoc.parameters import ParameterSpace
 from madoc.verdict.adequacy import (
-    NUMERICAL,
     actions_in_time,
     far_beyond_noise,
-    felt,
     in_full,
     is_certain,
     missing_term,
     of_small_terms,
-    to_remove,
     widening,
-    worth_naming,
 )
 from madoc.verdict.bench import Bench
 from madoc.verdict.remedies import is_of_spec, remedy
@@ -64,54 +58,29 @@ Measure = TypeVar("Measure", bound=Judged)
 
 def _doubts(
     bench: Bench, point: Float[np.ndarray, " d"], half_widths: Float[np.ndarray, " d"], shorter: int = 1
-) -> tuple[Suspicions, bool]:
-    """What the log says against the model, and whether that was tested with a finer integration step.
+) -> Suspicions:
+    """What the log says against the model.
 
-    Where the error of the integration step explains much, or as much as any certain term, it may hide others or look
-    like one. These are then tested with steps of a quarter of the length, on as many windows as there is time for. That
-    counts unless the error of those steps explains much too. A log that tells neither states nor what is needed to fit
-    them cannot be tested, nor can one without pairs of consecutive observations. Under a limit of time windows are as
-    many as that allows. With `shorter` they are so many times as short and as many.
+    A log that tells neither states nor what is needed to fit them cannot be tested, nor can one without pairs of
+    consecutive observations. Under a limit of time windows are as many as that allows. With `shorter` they are so many
+    times as short and as many.
     """
-    problem, task = bench.problem, bench.problem.simulator.task
+    problem = bench.problem
     ordered = bool((problem.dataset.episode_ends - problem.dataset.episode_starts > 1).any())
     told = bench.states_known or (bench.states.kind == "approximate" and ordered)
     if not told or problem.dataset.disturbance.shuffled == "next_observations":
-        return Suspicions(tested=False), False
+        return Suspicions(tested=False)
     given, most = (problem.dataset, bench.states), _windows_in_time(bench)
     enough = most is None or most >= bench.windows_to_test
     part = "tests of what the model lacks" if shorter == 1 else "the same tests on shorter windows"
     if not bench.begins(part, 0.0 if enough else np.inf):
-        return Suspicions(tested=False), False
+        return Suspicions(tested=False)
     usual = len(windows_of(*given, bench.change, fewest=bench.windows_to_test).rows)
     if shorter == 1 and most is not None and most < usual:
         bench.left_out.append(FEWER)
     doubts = suspicions(*given, problem.simulator, point, half_widths, bench.change, most=most, shorter=shorter)
     alternatives = in_full((*doubts.alternatives, *of_small_terms(doubts.terms)), doubts.terms)
-    doubts = replace(doubts, alternatives=alternatives)
-    step = to_remove(doubts.terms)
-    if step is None or task.source is None:
-        return doubts, False
-    seconds, used = FINER * doubts.control_steps / bench.rate, usual if most is None else min(usual, most)
-    in_time = int(used * min(1.0, TESTING * bench.seconds_left / max(seconds, 1e-9)))
-    enough = in_time >= min(used, bench.windows_to_test)
-    if not bench.begins("the same tests with a finer timestep", 0.0 if enough else np.inf):
-        return doubts, False
-    most = most if in_time >= used else in_time
-    finer = simulation.make(task.with_time_step(1.0 / FINER, substeps=FINER))
-    fine = suspicions(*given, finer, point, half_widths, bench.change, of_other_model=True, most=most, shorter=shorter)
-    spent = doubts.control_steps + FINER * fine.control_steps
-    left = felt(fine.terms)
-    if not fine.tested or (left is not None and left.explained >= NUMERICAL):
-        return replace(doubts, control_steps=spent), False
-    others = [
-        replace(each, causes=(INTEGRATION,)) if each.causes == (OTHER_WINDOWS,) else each for each in fine.alternatives
-    ]
-    others = [*doubts.alternatives, *others, *of_small_terms(fine.terms, worth_naming(step))]
-    terms = step, *(term for term in fine.terms if term.cause != INTEGRATION)
-    if in_time < used and FEWER not in bench.left_out:
-        bench.left_out.append(FEWER)
-    return replace(fine, terms=terms, alternatives=tuple(others), control_steps=spent), True
+    return replace(doubts, alternatives=alternatives)
 
 
 def _windows_in_time(bench: Bench) -> int | None:
@@ -151,7 +120,7 @@ def judged(
     coarse, exchanged = 0.0, _exchanged(bench, point, at)  # tests take what is left of the time
     if bench.simulator.task.source is not None and bench.begins("the length of the timestep"):
         coarse = coarseness(problem.dataset, bench.states, problem.simulator, point, bench.change)
-    doubts, finer = _doubts(bench, point, own)
+    doubts = _doubts(bench, point, own)
     # Actions that seem late are none where tests at the estimate exclude it.
     in_time = actions_in_time(doubts.terms, bench.simulator.control_step)
     against = (each for each in (*exchanged, *problem.dataset.findings) if each.contradicts)
@@ -185,20 +154,19 @@ def judged(
         tested=doubts.tested and EXCHANGED not in bench.left_out,
         open_in_time=tuple(itertools.compress(space.names, (shares >= OPEN) & (narrower < OPEN))),
         coarseness=coarse,
-        finer=finer,
         at_end=tuple(space.names[index] for index in at_end if narrower[index] < OPEN),
         open_at_end=tuple(space.names[index] for index in at_end if by_noise[index] < OPEN <= narrower[index]),
         concentration=doubts.concentration,
     )
     shorter = SHORTER if far_beyond_noise(found) and missing_term(found) is None else 1
     if shorter > 1:
-        doubts, finer = _doubts(bench, point, own, shorter)
-        found = _told_apart(found, doubts, finer=finer)
+        doubts = _doubts(bench, point, own, shorter)
+        found = _told_apart(found, doubts)
     unexplained = far_beyond_noise(found) and missing_term(found) is None
     contradicting = tuple(each for each in contradicting if unexplained or not each.rough)
     late = next((each for each in contradicting if each.late), None)
     term = missing_term(found) if late is None else _delay(doubts, late)
-    tested = partial(_richer, bench, point, own, doubts=doubts, finer=finer, shorter=shorter)
+    tested = partial(_richer, bench, point, own, doubts=doubts, shorter=shorter)
     richer = tested(term)
     with_lag = None
     if term is not None and richer is not None and richer.left and term.parameter.startswith(_DELAYED):
@@ -219,7 +187,7 @@ def _worth_keeping(terms: Sequence[MissingTerm]) -> tuple[MissingTerm, ...]:
     return tuple(itertools.compress(terms, kept))
 
 
-def _told_apart(found: Measure, doubts: Suspicions, *, finer: bool) -> Measure:
+def _told_apart(found: Measure, doubts: Suspicions) -> Measure:
     """The record with the terms that tests on shorter windows find, beside the error of the integration step before.
 
     That error is what tells whether anything is lacking at all, which windows of the usual length say.
@@ -227,7 +195,7 @@ def _told_apart(found: Measure, doubts: Suspicions, *, finer: bool) -> Measure:
     step = [term for term in found.missing_terms if term.cause == INTEGRATION]
     others = [term for term in _worth_keeping(doubts.terms) if term.cause != INTEGRATION]
     terms = tuple(sorted((*step, *others), key=lambda term: -abs(term.t)))
-    return replace(found, missing_terms=terms, finer=finer) if doubts.tested else found
+    return replace(found, missing_terms=terms) if doubts.tested else found
 
 
 def _delay(doubts: Suspicions, late: Finding) -> MissingTerm | None:
@@ -250,7 +218,6 @@ def _richer(
     term: MissingTerm | None,
     *,
     doubts: Suspicions,
-    finer: bool,
     shorter: int,
 ) -> RicherModel | None:
     """The model with a term, and with others in turn, if parameters of a spec add them and there is time for tests."""
@@ -262,7 +229,7 @@ def _richer(
         part = f"the model with {' and '.join(each.parameter for each in terms)}"
         if not bench.begins(part, BEFORE_OTHERS * doubts.control_steps / bench.rate):
             return None
-        return richer_model(*given, terms, finer=finer, most=_windows_in_time(bench), shorter=shorter)
+        return richer_model(*given, terms, most=_windows_in_time(bench), shorter=shorter)
 
     return in_turn(term, tested)
 

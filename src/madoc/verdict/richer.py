@@ -15,7 +15,6 @@ from jaxtyping import Float
 from madoc import simulation
 from madoc.calibration.holdout import RicherModel
 from madoc.data import Dataset
-from madoc.identification.candidate_effects import FINER
 from madoc.identification.candidate_terms import INTEGRATION
 from madoc.identification.missing_terms import suspicions
 from madoc.identification.noise import WHITE
@@ -60,7 +59,6 @@ def richer_model(
     scale: Float[np.ndarray, " observation"],
     terms: Sequence[MissingTerm],
     *,
-    finer: bool,
     most: int | None,
     shorter: int,
 ) -> Tested:
@@ -74,7 +72,6 @@ def richer_model(
         half_widths: Half of each one's 95 % interval in [-1, 1].
         scale: Typical change of each signal in a stride.
         terms: The terms, each of which a parameter of a spec adds, in the order in which they were found.
-        finer: Whether to integrate in steps of a quarter of the length, as the tests that found the terms did.
         most: Largest number of windows; None for the usual one.
         shorter: How many times as short and as many they are, as in the tests that found the terms.
     """
@@ -86,7 +83,7 @@ def richer_model(
     )
     late = pending_actions(delay, lag, simulator.control_step)
     task = replace(task, parameters=space, pending=max(task.pending, late))
-    wide = simulation.make(task.with_time_step(1.0 / FINER, substeps=FINER) if finer else task)
+    wide = simulation.make(task)
     values = [term.value for term in terms]
     start = np.append(point, space.to_unit(np.append(simulator.parameters.middle, values))[len(point) :])
     of_added = [4.0 * term.standard_error / (line.high - line.low) for term, line in zip(terms, added, strict=True)]

@@ -98,7 +98,7 @@ def lacks(run: Run) -> dict[str, object] | str:
             rows[at]["cause"] = f"{cause}, shape {1 + causes[:at].count(cause)}"
     alternatives = [_words(each, held) for each in held.alternatives]
     told = {"largest": number(largest, 2), "certain": number(CERTAIN)}
-    none_certain = bool(rows) and numerical(held) is None and not any(map(is_certain, held.missing_terms))
+    none_certain = bool(rows) and numerical(held.missing_terms) is None and not any(map(is_certain, held.missing_terms))
     return {"rows": rows, "alternatives": alternatives, "none_certain": none_certain} | told
 
 
