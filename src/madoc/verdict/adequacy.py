@@ -67,7 +67,7 @@ def missing_term(holdout: Judged, least: float | None = None) -> MissingTerm | N
 
 
 def worth_naming(terms: Sequence[MissingTerm]) -> float:
-    """Share in [0, 1] of the squared residuals from which a term is named, and is not what the timestep's error leaves."""
+    """Share in [0, 1] of the squared residuals from which a term is named: not what the timestep's error leaves."""
     step = integration(terms)
     return WORTH_NAMING if step is None or step.t < SUSPICIOUS else max(WORTH_NAMING, NOT_REMOVED * step.explained)
 
