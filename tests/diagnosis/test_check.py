@@ -12,9 +12,10 @@ from madoc.calibration import CalibrationProblem
 from madoc.data import logs
 from madoc.data.findings import Finding
 from madoc.diagnosis import check, refuse_fatal
+from madoc.diagnosis.diagnosis import _inexact_states_finding
 from madoc.diagnosis.excitation import excite
 from madoc.errors import MadocError
-from madoc.identification.states import states_of
+from madoc.identification.states import LoggedStates, states_of
 from madoc.simulation.response import refuse_insensitive
 from robots import ARM, counted
 
@@ -200,8 +201,19 @@ def test_hidden_speeds_are_told_and_intervals_still_expected(robot, columns, che
     (note,) = [finding for finding in findings if finding[1] == "signals"]
     assert note[0] == "note"
     assert "states cannot be rebuilt from the log" in note[2]
+    assert "): least-squares estimates them from what is logged; this check did not compare the model" in note[2]
     assert found.explanation is None
     assert (found.excitation.half_width < 0.1 * (robot.task.parameters.high - robot.task.parameters.low)).all()
+
+
+def test_a_base_that_the_floor_tells_is_said_to_stand_there():
+    nothing = np.zeros(2, bool)
+    logged = LoggedStates("approximate", np.zeros((1, 2)), np.zeros(1, int), "no z", 2, 1, np.ones(2, bool), nothing)
+    assert (
+        ", and its base stands on the floor by its attitude; this check" in _inexact_states_finding(logged, None).what
+    )
+    unknown = _inexact_states_finding(replace(logged, kind="unknown"), None).sentence
+    assert "floor" not in unknown and unknown.endswith("log the position and the velocity of every joint")
 
 
 def test_few_rows(robot, columns, checked):

@@ -124,12 +124,16 @@ def check(
 
 def _inexact_states_finding(logged: LoggedStates, robot: Robot | None) -> Finding:
     reasons = ", ".join(robot.undetermined) if robot is not None and robot.undetermined else logged.reason
+    estimated = ""
+    if logged.kind == "approximate":
+        floor = ", and its base stands on the floor by its attitude" if logged.placed.any() else ""
+        estimated = f": least-squares estimates them from what is logged{floor}"
     return Finding(
         "note",
-        f"states cannot be rebuilt from the log ({reasons}), so the model was not compared with it, and methods "
-        "that take logged states for true will refuse",
+        f"states cannot be rebuilt from the log ({reasons}){estimated}; this check did not compare the model with the "
+        "log, and methods that take logged states for true will refuse",
         "signals",
-        "log the position and the velocity of every joint if you can",
+        "" if estimated else "log the position and the velocity of every joint",
     )
 
 
