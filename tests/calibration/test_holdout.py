@@ -20,7 +20,7 @@ COMMON = {
     "rows": 400,
     "episodes": 1,
     "estimate": {"mass": 0.2},
-    "values": {"mass": (1.2, 0.02)},
+    "values": {"mass": (1.2, 0.02, "kg")},
     "interval_shares": {"mass": 0.01},
     "against_chance": (AgainstChance("the simulator", 0.9, 0.02), AgainstChance("staying in place", 0.2, 0.002)),
     "noise": {"q": 0.1},

@@ -56,7 +56,7 @@ def result(**changes):
         rows=1000,
         episodes=1,
         estimate=dict.fromkeys(PARAMETERS, 0.0),
-        values={name: (at, std) for name, (at, std, *_) in PARAMETERS.items()},
+        values={name: (at, std, unit) for name, (at, std, _, _, unit, _) in PARAMETERS.items()},
         interval_shares=dict.fromkeys(PARAMETERS, 0.1),
         against_chance=(AgainstChance("staying in place", 0.5, 0.002),),
         noise={},

@@ -79,7 +79,7 @@ def test_the_strongest_correlation_is_told(whole):
 
 def test_missing_terms_are_drawn_by_how_far_they_move_the_estimates(whole):
     friction, spring = content(whole, "lacks")["rows"]
-    assert (friction["width"], friction["certain"], friction["moves"]) == (100.0, True, "gravity by −0.4")
+    assert (friction["width"], friction["certain"], friction["moves"]) == (100.0, True, "gravity by −0.4 m/s²")
     assert (spring["width"], spring["certain"], spring["value"]) == (25.0, False, "1 ± 0.4 N·m/rad")
     assert content(whole, "lacks")["alternatives"] == [("a spring (jnt_stiffness.hip)", "gravity 0.1 ± 0.08")]
     assert "0.2 ± 0.02 N·m, <b>t = 10</b>" in drawn(whole, "lacks")

@@ -52,10 +52,10 @@ def test_an_error_has_two_digits_and_its_value_as_many_decimals(value, error, wo
     assert with_error(value, error) == words
 
 
-def test_a_search_that_had_not_settled_is_to_be_resumed_before_anything_else():
+def test_a_search_that_its_budget_has_ended_is_to_be_resumed_before_anything_else():
     """Only `USABLE` has something better than itself; what the other words ask for does not depend on the search."""
-    assert "; better, find what the model lacks" in to_do("USABLE", settled=True)
-    resumed = to_do("USABLE", settled=False)
+    assert "; better, find what the model lacks" in to_do("USABLE", converged=True)
+    resumed = to_do("USABLE", converged=False)
     assert resumed.endswith("; better, resume the search with a larger budget (--resume, --budget)")
     assert resumed.startswith("use the calibrated model in MuJoCo as it is") and "lacks" not in resumed
-    assert to_do("NO_IMPROVEMENT", settled=False) == to_do("NO_IMPROVEMENT", settled=True)
+    assert to_do("NO_IMPROVEMENT", converged=False) == to_do("NO_IMPROVEMENT", converged=True)

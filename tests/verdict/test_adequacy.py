@@ -46,7 +46,7 @@ def held(*terms, alternatives=()):
             "rows": 400,
             "episodes": 1,
             "estimate": {},
-            "values": {"mass": (1.2, 0.01)},
+            "values": {"mass": (1.2, 0.01, "kg")},
             "interval_shares": {},
             "against_chance": chance,
         },
@@ -224,13 +224,14 @@ def test_a_force_of_two_shapes_is_no_rival_of_itself():
 
 
 def test_a_term_beside_the_error_of_the_timestep_is_named_though_that_explains_more():
-    step = replace(term(INTEGRATION, t=20.0, explained=0.4, parameter=""), value=1.2)
-    friction = term(t=8.0, explained=0.21)
+    step = replace(term(INTEGRATION, t=20.0, explained=0.4, parameter=""), value=1.0)
+    friction = term(t=8.0, explained=0.021)
     assert numerical([step, friction]) == step
     assert missing_term(held(step, friction)) == friction
-    # Up to half of what the error explains may be what is left of it; intervals cover the estimate with such a term.
-    left = replace(friction, explained=0.19)
+    # Of a value of 0.5 a half of the error is left; intervals cover the estimate with a term that may be it.
+    step, left = replace(step, value=0.5), replace(friction, explained=0.19)
     assert missing_term(held(step, left)) is None and len(of_small_terms([step, left])) == 1
+    assert missing_term(held(step, replace(left, explained=0.21))) is not None
     assert missing_term(held(replace(step, t=1.9), left)) == left  # an error that may be chance was not taken away
     assert missing_term(held(replace(step, value=3.0), left)) == left  # nor one of another effect
     assert numerical([replace(step, explained=0.3), term(explained=0.31)]) is None

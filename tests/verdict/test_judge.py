@@ -31,7 +31,7 @@ COMMON = {
     "rows": 400,
     "episodes": 1,
     "estimate": {"mass": 0.2, "damping": -0.4},
-    "values": {"mass": (1.2, 0.01), "damping": (0.6, 0.2)},
+    "values": {"mass": (1.2, 0.01, "kg"), "damping": (0.6, 0.2, "1")},
     "interval_shares": {"mass": 0.01, "damping": 0.2},
     "against_chance": (AgainstChance("the simulator", 0.9, 0.002), AgainstChance("staying in place", 0.2, 0.01)),
     "noise": {"q": 0.1},
@@ -105,18 +105,8 @@ def test_a_certain_term_is_a_mismatch_though_it_hardly_moves_the_estimate():
     verdict = judge(replace(PREDICTED, missing_terms=(offset,), richer=richer))
     assert verdict.word == "MODEL_MISMATCH"
     assert "the model lacks an offset of the sensor (signal_bias.hip): a value of 0.1 ± 0.01" in verdict.sentence
-    assert "(t = 10), and would move mass by +0.001 from 1.2; a model with it explains the log" in verdict.sentence
+    assert "(t = 10), and would move mass by +0.001 from 1.2 kg; a model with it explains the log" in verdict.sentence
     assert verdict.sentence.endswith("{field: signal_bias, element: hip, low: 0, high: 0.2}")
-
-
-def test_an_end_of_a_range_is_told_beside_a_term_though_that_leaves_the_parameter_open():
-    offset = MissingTerm("an offset of the sensor", "signal_bias.hip", 0.1, 0.01, "1", 0.8, 10.0, {"mass": 0.1})
-    useful = {"open_loop": (predicted_over(1.0, 0.4, (0.3, 0.6)),)}
-    verdict = judge(replace(PREDICTED, missing_terms=(offset,), open_at_end=("damping",), **useful))
-    assert verdict.word == "USABLE"
-    assert verdict.sentence.endswith(
-        "damping at the end of the range: the true value may lie beyond it, so widen it first"
-    )
 
 
 def test_errors_beyond_those_of_noise_and_random_forces_are_a_mismatch():

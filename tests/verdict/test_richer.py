@@ -67,7 +67,7 @@ def test_what_a_model_with_a_term_still_lacks_is_added_in_turn():
         return RicherModel(terms[0].parameter, leaves[len(terms)], tuple(terms[1:])), knee
 
     found = in_turn(hip, tested)
-    assert _advice(replace(held(hip), richer=found), hip) == (
+    assert _advice(replace(held(hip, knee), richer=found), hip) == (
         "a model with it and friction (dof_frictionloss.knee) explains the log: add to the spec's parameters: "
         "{field: dof_frictionloss, element: hip, low: 0, high: 2} and "
         "{field: dof_frictionloss, element: knee, low: 0, high: 2}"
@@ -76,6 +76,8 @@ def test_what_a_model_with_a_term_still_lacks_is_added_in_turn():
     assert in_turn(hip, tested) == RicherModel("dof_frictionloss.hip", ("friction at the knee",))
     assert in_turn(hip, lambda terms: tested(terms) if len(terms) == 1 else None).others == ()
     assert in_turn(hip, lambda terms: None) is None
+    late = term(parameter="action_delay")
+    assert in_turn(late, tested) == RicherModel("action_delay", ("friction at the knee",))
 
 
 def test_the_next_term_is_certain_of_a_spec_and_alone():
@@ -84,7 +86,7 @@ def test_the_next_term_is_certain_of_a_spec_and_alone():
     spring = term("a spring", parameter="jnt_stiffness.hip", explained=0.45)
     assert _next([friction, uneven]) == friction  # no spec can say the other
     assert _next([friction, spring]) is None
-    assert _next([replace(friction, t=4.9)]) is None
+    assert _next([replace(friction, t=4.9)]) is None and _next([replace(friction, explained=0.019)]) is None
     assert _next([uneven]) is None
 
 

@@ -154,7 +154,7 @@ class Judged:
         rows: Number of rows held out.
         episodes: Number of episodes held out.
         estimate: Estimate of each parameter, scaled to [-1, 1] over its range.
-        values: Each estimate and half of its 95 % interval before that was widened, in the parameter's unit.
+        values: Each estimate, half of its 95 % interval before that was widened, and their unit.
         interval_shares: Share of each parameter's range that its 95 % confidence interval covers, at most 1.
         against_chance: Permutation tests, one for each of several predictors.
         noise: Standard deviation of the sensor noise of those signals where it can be estimated, in the signal's unit.
@@ -167,7 +167,7 @@ class Judged:
         open_in_time: Parameters that only the alternatives leave open, where there was no time to test these on as many
             windows as usual.
         at_end: Parameters estimated at an end of their range that is no physical bound, but for those that are open.
-        open_at_end: Those of the latter that only the alternatives leave open.
+        open_at_end: Open parameters at such an end that without the alternatives would not be open.
         contradictions: Sentences of the check of the log that contradict the spec, such as actions that come late.
         coarseness: By how many typical changes predictions one stride ahead change where the model is integrated in
             steps of a quarter of the length, the median over signals; 0 for a robot without a spec.
@@ -180,7 +180,7 @@ class Judged:
     rows: int
     episodes: int
     estimate: dict[str, float]
-    values: dict[str, tuple[float, float]]
+    values: dict[str, tuple[float, float, str]]
     interval_shares: dict[str, float]
     against_chance: tuple[AgainstChance, ...]
     noise: dict[str, float]

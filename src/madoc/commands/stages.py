@@ -244,7 +244,9 @@ def calibration_text(result: "CalibrationResult") -> tuple[RenderableType, ...]:
     from madoc.report.words import to_do
 
     verdict = (str(result.verdict),) if result.verdict else ()
-    advice = (f"what to do: {to_do(result.verdict.word, settled=result.settled)}",) if result.verdict else ()
+    advice = (
+        (f"what to do: {to_do(result.verdict.word, converged=result.status == 'converged')}",) if result.verdict else ()
+    )
     predictions = result.predictions()
     return (*verdict, result.table(), *(() if predictions is None else (predictions,)), result.summary(), *advice)
 

@@ -60,8 +60,8 @@ def scale_findings(
 def _scale_of_masses(names: list[str], *, only_ratios: bool) -> Finding:
     if only_ratios:
         what = (
-            f"only ratios can be found: {listed(names)} times one common factor change nothing that is seen, as a gear "
-            "and all masses scaled alike"
+            f"only ratios can be found: {listed(names)} times one common factor change nothing that is seen, as masses "
+            "and forces that are all twice as large"
         )
         return Finding("warning", what, "parameters", "take one of them out of the spec, at a value that was measured")
     what = (

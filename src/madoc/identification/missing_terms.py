@@ -112,8 +112,11 @@ def suspicions(
     if products is None or len(products) < FEWEST + len(led):
         return Suspicions(control_steps=SIMULATED.control_steps - began, tested=negligible(both))
     tests = TermTests(products, tuple(tried), simulator.parameters, half_widths, runs[counted])
-    drifts, others = drifts_of(tests, simulator, readings, runs, fit, point, dataset.names_of_runs)
-    terms = [*_terms(tests), *_below_minimum(tests, led), *drifts]
+    beside = tests.less_steps()
+    drifts, others = drifts_of(beside, simulator, readings, runs, fit, point, dataset.names_of_runs)
+    smaller = [replace(each, explained=tests.beside_steps * each.explained) for each in _below_minimum(beside, led)]
+    drifts = [replace(each, explained=tests.beside_steps * each.explained) for each in drifts]
+    terms = [*_terms(tests), *smaller, *drifts]
     unlisted, covering = unlisted_forces(tests, families(simulator, responses), readings, fit, by_terms, responses)
     terms, others = [*terms, *unlisted], [*others, *covering]
     for other in _of_other_windows(tests, led - point):
@@ -128,7 +131,17 @@ def suspicions(
     most_significant_first = sorted(terms, key=lambda term: -abs(term.t))
     where = concentration(dataset, windows, fit, simulator.task.signal_names, simulator.control_step)
     found = tuple(most_significant_first), tuple(others), tuple(imitated_terms(tests))
-    return Suspicions(*found, SIMULATED.control_steps - began, concentration=where, alike=alike(fit, readings))
+    lasting = alike(_less_steps(fit, tests, by_terms), readings)
+    return Suspicions(*found, SIMULATED.control_steps - began, concentration=where, alike=lasting)
+
+
+def _less_steps(fit: Fit, tests: TermTests, by_terms: Float[np.ndarray, "windows values terms"]) -> Fit:
+    """The fit with residuals that the error of the integration step leaves, to first order."""
+    if tests.steps is None:
+        return fit
+    index, found = tests.steps
+    moved = found.change * np.nan_to_num(by_terms[..., index]) + fit.slopes.by_parameters @ found.shifts
+    return replace(fit, slopes=replace(fit.slopes, residuals=fit.slopes.residuals + moved))
 
 
 def _effects(
@@ -187,12 +200,9 @@ def _beside_steps(tests: TermTests, chosen: list[int]) -> bool:
 
 def _terms(tests: TermTests) -> Iterator[MissingTerm]:
     """The score test of every candidate whose value is physical; the error of the integration step is taken away."""
-    steps, left = tests.steps()
     for index, candidate in enumerate(tests.tried):
-        beside = [each for each in steps if each != index]
-        found = tests.score(index, beside)
+        found = tests.alone(index)
         if found is not None:
-            found = replace(found, explained=left * found.explained) if beside else found
             yield term_of(candidate, found, tests.by_name(found.shifts))
 
 
@@ -320,7 +330,7 @@ def _fitted(
     shifts, physical = tests.by_name(at[: len(led)] - point), space.to_physical(at)
     terms = {}
     for place, (candidate, parameter, _) in enumerate(possible, start=len(led)):
-        found = tests.score(tests.tried.index(candidate))
+        found = tests.alone(tests.tried.index(candidate))
         value, deviation = float(physical[place]), float(error[place]) * (parameter.high - parameter.low) / 2.0
         if found is not None and deviation > 0.0:
             significance = deviate((value - candidate.nominal) / deviation, found.freedom)

@@ -59,6 +59,13 @@ class Products:
         order = [*first, *range(len(first), self.each.shape[1])]
         return Products(self.each[:, order][:, :, order], len(kept))
 
+    def less(self, index: int, change: float) -> "Products":
+        """The same of residuals from which a column with this change of its coefficient is taken away."""
+        each = self.each.copy()
+        each[:, 0] += change * self.each[:, index]
+        each[:, :, 0] += change * each[:, :, index]
+        return Products(each, self.count)
+
     def combined(
         self, included: Sequence[int], terms: Sequence[int], weights: Float[np.ndarray, "some few"]
     ) -> "Products":

@@ -1,7 +1,8 @@
 """What score tests of a log say of single terms: the tests, the terms they find, and other estimates they allow."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -148,16 +149,35 @@ class TermTests:
         below = found is not None and candidate.nominal + found.change * candidate.reference < candidate.least
         return None if below else found
 
-    def steps(self) -> tuple[list[int], float]:
-        """The error of the integration step if it is significant, and the share of squared residuals beside it.
+    @cached_property
+    def steps(self) -> tuple[int, Score] | None:
+        """The error of the integration step and its score; None if it is not significant, or of another effect.
 
-        A value that it cannot have is of something else, which the tests of other terms are to find.
+        Of another effect is a value that no timestep has: the tests of other terms are to find that one.
         """
         for index, candidate in enumerate(self.tried):
             if candidate.cause == INTEGRATION and (found := self.score(index)) is not None:
-                taken = abs(found.t) >= SUSPICIOUS and of_steps(found.change)
-                return ([index], max(0.0, 1.0 - found.explained)) if taken else ([], 1.0)
-        return [], 1.0
+                return (index, found) if abs(found.t) >= SUSPICIOUS and of_steps(found.change) else None
+        return None
+
+    @property
+    def beside_steps(self) -> float:
+        """Share in [0, 1] of the squared residuals that the error of the integration step does not explain."""
+        return 1.0 if self.steps is None else max(0.0, 1.0 - self.steps[1].explained)
+
+    def alone(self, index: int) -> Score | None:
+        """The score of a candidate beside the error of the integration step; its share is one of all residuals."""
+        if self.steps is None or self.steps[0] == index:
+            return self.score(index)
+        found = self.score(index, [self.steps[0]])
+        return None if found is None else replace(found, explained=self.beside_steps * found.explained)
+
+    def less_steps(self) -> "TermTests":
+        """The same tests of what the error of the integration step leaves."""
+        if self.steps is None:
+            return self
+        index, found = self.steps
+        return replace(self, products=self.products.less(1 + self.products.count + index, found.change))
 
     def by_name(self, values: Float[np.ndarray, " d"]) -> dict[str, float]:
         """Values in [-1, 1] of each parameter, by name and in half-widths; no estimate leaves its range by more."""

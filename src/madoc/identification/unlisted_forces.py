@@ -116,7 +116,7 @@ def unlisted_forces(
         by_terms: Derivatives of the residuals by the listed terms.
         responses: What small forces do to the windows.
     """
-    steps, left = tests.steps()
+    steps = [] if tests.steps is None else [tests.steps[0]]
     terms, others, every = list[MissingTerm](), list[Alternative](), list(families)
     first, beside = 1 + tests.products.count, by_terms[..., steps]
     listed = replace(fit.slopes, by_parameters=np.concatenate([fit.slopes.by_parameters, beside], axis=-1))
@@ -136,9 +136,8 @@ def unlisted_forces(
         growing = f"grows most with {quantity}" if quantity != CONSTANT else "is about constant"
         cause = f"{UNLISTED} ({family.place}), which {growing}"
         least = np.sign(found.shifts) * np.maximum(np.abs(found.shifts) - NORMAL_95 * found.errors, 0.0)
-        terms.append(
-            MissingTerm(cause, "", size, size / t, family.unit, left * found.explained, t, tests.by_name(least))
-        )
+        explained = tests.beside_steps * found.explained
+        terms.append(MissingTerm(cause, "", size, size / t, family.unit, explained, t, tests.by_name(least)))
         if t >= LIKELY_FORCE:
             others.append(tests.alternative((cause,), found.shifts, NORMAL_95 * found.errors))
     return terms, others

@@ -18,22 +18,22 @@ TO_DO = {
     "CALIBRATED": "use the model, within the intervals of its values: madoc export writes it for other tools",
     "USABLE": "use the calibrated model in MuJoCo as it is, and do not take its values for the machine's own; better, "
     "find what the model lacks, put it into the spec and calibrate again",
-    "NO_IMPROVEMENT": "do what the sentence above says; else give it a larger budget (--budget), or try another "
+    "NO_IMPROVEMENT": "do what the verdict says; else give it a larger budget (--budget), or try another "
     "method (--method)",
-    "NOT_IDENTIFIABLE": "do what the sentence above says; else log motion that moves these parameters, or calibrate "
+    "NOT_IDENTIFIABLE": "do what the verdict says; else log motion that moves these parameters, or calibrate "
     "fewer of them",
-    "MODEL_MISMATCH": "do not use these values; find what the sentence above describes, on the machine or in the "
+    "MODEL_MISMATCH": "do not use these values; find what the verdict describes, on the machine or in the "
     "spec and the log; where it gives a line for the spec, add that line; then calibrate again",
     "DATA_REJECTED": "check the order of the rows, and which columns of the log the spec reads",
 }
-"""What to do first after each verdict of a search that had settled."""
+"""What to do first after each verdict of a search that has converged."""
 _RESUME = "better, resume the search with a larger budget (--resume, --budget)"
 
 
-def to_do(word: str, *, settled: bool) -> str:
-    """What to do first after a verdict."""
+def to_do(word: str, *, converged: bool) -> str:
+    """What to do first after a verdict on a search that has converged, or that its budget has ended."""
     first, _, then = TO_DO[word].partition("; better, ")
-    return f"{first}; {_RESUME}" if then and not settled else TO_DO[word]
+    return f"{first}; {_RESUME}" if then and not converged else TO_DO[word]
 
 
 _METRIC_WORDS = {

@@ -43,9 +43,6 @@ HALF = 0.5
 """Share explained by a listed term over that of forces that are not listed, from which these are not named."""
 WORTH_NAMING = 0.02
 """Share in [0, 1] of the squared residuals that a term must explain to be named as what the model lacks."""
-NOT_REMOVED = 0.5
-"""Share in [0, 1] of what the integration step's error explains, up to which another term may be what is left of it: at
-contacts derivatives follow only a part of that error."""
 SURER = 1.314
 """Half of a 99 % interval over half of a 95 % interval: an alternative is covered unless one in a hundred is worse."""
 NAMED = 3
@@ -67,9 +64,13 @@ def missing_term(holdout: Judged, least: float | None = None) -> MissingTerm | N
 
 
 def worth_naming(terms: Sequence[MissingTerm]) -> float:
-    """Share in [0, 1] of the squared residuals from which a term is named: not what the timestep's error leaves."""
+    """Share in [0, 1] of the squared residuals from which a term is named: not what the timestep's error leaves.
+
+    At contacts derivatives follow a part of that error only: its value comes out below 1 by the part that is left.
+    """
     step = integration(terms)
-    return WORTH_NAMING if step is None or step.t < SUSPICIOUS else max(WORTH_NAMING, NOT_REMOVED * step.explained)
+    left = 0.0 if step is None or step.t < SUSPICIOUS else (1.0 - step.value) * step.explained
+    return max(WORTH_NAMING, left)
 
 
 def of_small_terms(terms: Sequence[MissingTerm]) -> tuple[Alternative, ...]:

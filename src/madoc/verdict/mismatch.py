@@ -28,7 +28,7 @@ def lacking(holdout: HoldOut, *, settled: bool, unlike_noise: bool) -> Verdict |
     An end of a range at which a search stands that has not settled says nothing. `unlike_noise` tells that residuals
     have longer tails than noise has, that each is like the next, or that they follow from state and action.
     """
-    holdout = holdout if settled else replace(holdout, at_end=())
+    holdout = holdout if settled else replace(holdout, at_end=(), open_at_end=())
     found = _missing(holdout, missing_term(holdout)) or _mismatch(holdout)
     if far_beyond_noise(holdout) and numerical(holdout.missing_terms) is None:
         found = found or _missing(holdout, missing_term(holdout, least=0.0))
@@ -58,8 +58,8 @@ def _missing(holdout: HoldOut, term: MissingTerm | None) -> Verdict | None:
 
 def _moved(holdout: HoldOut, term: MissingTerm, name: str) -> str:
     """By how much a term would move an estimate, in the parameter's unit."""
-    estimate, half_width = holdout.values[name]
-    return f"{name} by {half_width * term.shifts[name]:+.2g} from {estimate:.4g}"
+    estimate, half_width, unit = holdout.values[name]
+    return f"{name} by {half_width * term.shifts[name]:+.2g} from {estimate:.4g} {unit}".removesuffix(" 1")
 
 
 def _changing(holdout: HoldOut, term: MissingTerm) -> str:
@@ -88,7 +88,13 @@ def _proved(holdout: HoldOut, term: MissingTerm) -> bool:
     """Whether the model with a term explains the log, and no other term explains nearly as much."""
     richer = holdout.richer
     explains = richer is not None and richer.parameter == term.parameter and not richer.left
-    return explains and not as_likely(holdout.missing_terms, term)
+    return explains and not _rivals(holdout, term)
+
+
+def _rivals(holdout: HoldOut, term: MissingTerm) -> list[MissingTerm]:
+    """Other terms that explain nearly as much, but for those that were added with it."""
+    added = [(each.cause, each.parameter) for each in holdout.richer.others] if holdout.richer is not None else []
+    return [each for each in as_likely(holdout.missing_terms, term) if (each.cause, each.parameter) not in added]
 
 
 def _advice(holdout: HoldOut, term: MissingTerm) -> str:
@@ -96,7 +102,7 @@ def _advice(holdout: HoldOut, term: MissingTerm) -> str:
 
     Terms that explain nearly as much are told with it.
     """
-    others = list(dict.fromkeys(map(named, as_likely(holdout.missing_terms, term))))[:_MOST_NAMED]
+    others = list(dict.fromkeys(map(named, _rivals(holdout, term))))[:_MOST_NAMED]
     alike = f"{' or '.join(others)} would explain nearly as much" if others else ""
     if not is_of_spec(term):
         return "; ".join(part for part in (alike, remedy(term)) if part)

@@ -28,7 +28,7 @@ from madoc.verdict.statistics import (
 )
 
 MOST_ROWS = 4000
-"""Largest number of held-out rows whose residuals are compared with those of later rows."""
+"""Largest number of held-out rows whose residuals of single steps are looked at for noise and random forces."""
 TOUCHING = 0.1
 """Share in [0, 1] of held-out windows in which bodies touch; with more, noise of a state is not small for motion."""
 ROUNDED = 3.0

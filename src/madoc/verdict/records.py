@@ -136,15 +136,13 @@ def judged(
     narrower = _shares(*widths, () if FEWER in bench.left_out else doubts.alternatives)
     at_end = [space.names.index(name) for name in space.at_end(point, ends)]  # an open one tells of no end
     by_noise = _shares(*widths, ())
-    signals, halves = bench.simulator.task.signal_names[: len(noise)], own * (space.high - space.low) / 2.0
+    signals = bench.simulator.task.signal_names[: len(noise)]
     found = record(
         split=bench.split,
         rows=len(bench.held_out),
         episodes=len(bench.held_out.episode_starts),
         estimate=dict(zip(space.names, point.tolist(), strict=True)),
-        values=dict(
-            zip(space.names, zip(space.to_physical(point).tolist(), halves.tolist(), strict=True), strict=True)
-        ),
+        values=_values(space, point, own),
         interval_shares=of_range,
         against_chance=(*by_model, *bench.model_free),
         noise=dict(zip(signals, (noise * bench.change[: len(noise)]).tolist(), strict=True)),
@@ -179,6 +177,14 @@ def judged(
     tried = [name for name, model in (("constant delay", richer), ("lag of first order", with_lag)) if model]
     told = tuple(_contradiction(each, term, richer, tried) for each in contradicting)
     return replace(found, richer=richer, contradictions=told)
+
+
+def _values(
+    space: ParameterSpace, point: Float[np.ndarray, " d"], half_widths: Float[np.ndarray, " d"]
+) -> dict[str, tuple[float, float, str]]:
+    """Each estimate and half of its interval in the parameter's unit, and that unit."""
+    physical = space.to_physical(point).tolist(), (half_widths * (space.high - space.low) / 2.0).tolist()
+    return {row.name: (at, half, row.unit) for row, at, half in zip(space.parameters, *physical, strict=True)}
 
 
 def _worth_keeping(terms: Sequence[MissingTerm]) -> tuple[MissingTerm, ...]:

@@ -23,7 +23,7 @@ from madoc.identification.term_tests import LIKELY_FORCE, MissingTerm, named
 from madoc.parameters import ParameterSpace
 from madoc.simulation.base import Simulator
 from madoc.simulation.delay import pending_actions
-from madoc.verdict.adequacy import as_likely, is_certain, likeliest
+from madoc.verdict.adequacy import as_likely, is_certain, likeliest, worth_naming
 from madoc.verdict.remedies import is_of_spec, line_of
 
 MOST_ADDED = 3
@@ -36,10 +36,12 @@ Tested = tuple[RicherModel, MissingTerm | None] | None
 def in_turn(term: MissingTerm, tested: Callable[[Sequence[MissingTerm]], Tested]) -> RicherModel | None:
     """The model with a term, or with others that it still lacks as well if all together explain the log.
 
-    `tested` tests the model with some terms. None if the first one could not be tested.
+    A delay is tried alone, as a lag may be what is there in its place. `tested` tests the model with some terms. None
+    if the first one could not be tested.
     """
     first, added, further = None, list[MissingTerm](), term
-    while len(added) < MOST_ADDED and (found := tested([*added, further])) is not None:
+    most = 1 if term.parameter.startswith(("action_delay", "action_lag")) else MOST_ADDED
+    while len(added) < most and (found := tested([*added, further])) is not None:
         model, following = found
         if not model.left:
             return model
@@ -96,12 +98,12 @@ def richer_model(
     left = [each for each in found.terms if each.cause != INTEGRATION and abs(each.t) >= LIKELY_FORCE]
     more = (f"something that lasts over several rows (correlation {found.alike:.2f})",) if found.alike > WHITE else ()
     model = RicherModel(terms[0].parameter, (*map(named, left), *more), tuple(terms[1:]))
-    return (model, _next(left)) if found.tested else None
+    return (model, _next(found.terms)) if found.tested else None
 
 
-def _next(left: Sequence[MissingTerm]) -> MissingTerm | None:
+def _next(terms: Sequence[MissingTerm]) -> MissingTerm | None:
     """The likeliest of the certain terms that a model still lacks, if a spec can add that one and none as likely."""
-    certain = [term for term in left if is_certain(term)]
+    certain = [term for term in terms if is_certain(term) and term.explained >= worth_naming(terms)]
     term = likeliest(certain)
     alone = term is not None and is_of_spec(term) and not any(map(is_of_spec, as_likely(certain, term)))
     return term if alone else None

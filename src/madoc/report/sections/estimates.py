@@ -105,6 +105,7 @@ def lacks(run: Run) -> dict[str, object] | str:
 def _row(term: MissingTerm, largest: float, held: HoldOut, units: Mapping[str, str]) -> dict[str, object]:
     """A term as its bar shows it: the largest shift of a parameter, relative to the largest of all terms."""
     name = max(term.shifts, key=lambda each: abs(term.shifts[each]))
+    _, half, of_moved = held.values[name]
     field, _, element = term.parameter.partition(".")
     unit = units.get(element, "") if field == "signal_bias" else unit_words(term.unit)
     value = f"{with_error(term.value, term.error)} {unit}".rstrip()
@@ -114,7 +115,7 @@ def _row(term: MissingTerm, largest: float, held: HoldOut, units: Mapping[str, s
         "value": value,
         "t": number(term.t, 3),
         "explained": percent(term.explained),
-        "moves": f"{name} by {number(term.shifts[name] * held.values[name][1], 2)}",
+        "moves": f"{name} by {number(term.shifts[name] * half, 2)} {unit_words(of_moved)}".rstrip(),
         "width": round(100.0 * _largest(term) / largest, 2) if largest else 0.0,
         "certain": is_certain(term),
     }
