@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from planted_logs import ROBOTS, log_of
 
-from madoc import simulation
+from madoc import robots, simulation
 from madoc.calibration import CalibrationProblem
 from madoc.data import Disturbance, disturb, observed_task
 from madoc.identification.states import logged_states
@@ -19,7 +19,8 @@ from madoc.verdict import open_loop as module
 from madoc.verdict.mismatch import BEYOND_RANDOM
 from madoc.verdict.open_loop import MOST, as_given, beyond_imitated, open_loop
 from madoc.verdict.statistics import ABOVE_NOISE
-from robots import recorded
+from own_robots import SPRING_SPEC, write_robot
+from robots import SPRING_TRUTH, recorded
 
 TASK, TRUTH = ROBOTS["spring"]
 TASK = replace(TASK, velocities=1)
@@ -118,6 +119,25 @@ def test_logged_predictions_are_compared_with_those_of_chance_up_to_a_second():
     honest = point + 0.1 * np.random.default_rng(3).standard_normal((8, len(point)))
     unsure = [open_loop(bench, each, covariance=1e-2 * np.eye(len(point)), noise=noise)[-2] for each in honest]
     assert sum(max(each.beside_noise.values()) > BEYOND_RANDOM for each in unsure) == 0
+
+
+@pytest.mark.parametrize("fits_starts", [False, True])
+def test_errors_that_the_timestep_makes_are_in_an_imitated_hold_out_too(tmp_path, monkeypatch, fits_starts):
+    """The log is of a timestep of a quarter of the length: at the truth nothing else is wrong, without noise."""
+    task = robots.load(write_robot(tmp_path, SPRING_SPEC)).task
+    log = recorded(task.with_time_step(0.25, substeps=4), SPRING_TRUTH, 600, jax.random.key(0))
+    kept, held = log.split(0.3)
+    bench = Bench(CalibrationProblem(kept, simulation.make(task, threads=1)), held, jax.random.key(0))
+    space = bench.simulator.parameters
+    point = space.to_unit(space.vector(SPRING_TRUTH))
+    told = {"covariance": 1e-16 * np.eye(len(point)), "noise": np.full(2, 1e-9), "fits_starts": fits_starts}
+    found = open_loop(bench, point, **told)[1]
+    assert found.seconds == 0.3 and not found.whole
+    assert 0.5 < max(found.beside_noise.values()) < 1.1
+    monkeypatch.setattr(module, "_finer", lambda bench: bench.simulator)
+    without = max(open_loop(bench, point, **told)[1].beside_noise.values())
+    # From logged starts a part of the errors passes for random forces, which are read off the same log.
+    assert without > (BEYOND_RANDOM if fits_starts else 1.1 * max(found.beside_noise.values()))
 
 
 def test_loose_rows_are_not_predicted_over_time():

@@ -2,8 +2,9 @@
 
 The simulator starts where the log does, gets the logged actions, and runs on. Its errors after a tenth of a second, a
 second and whole runs stand beside those of the user's own model as it was given, and of mid-range. They also stand
-beside those that chance would make: the sensors' noise, random forces (those that are read off the log where starts are
-logged, and else those that an ensemble filter found), and the estimate's uncertainty.
+beside those that chance and the timestep would make: the sensors' noise, random forces (those that are read off the
+log where starts are logged, and else those that an ensemble filter found), the estimate's uncertainty, and what a
+timestep of a quarter of the length changes, as a machine has none.
 """
 
 from dataclasses import replace
@@ -16,6 +17,7 @@ from madoc import simulation
 from madoc.calibration.holdout import OpenLoop
 from madoc.data import stride
 from madoc.identification import random_forces
+from madoc.identification.candidate_effects import FINER
 from madoc.identification.noise import residual_noise
 from madoc.identification.replay import window_residuals
 from madoc.identification.states import logged_states
@@ -192,8 +194,10 @@ def _from_logged(
     chance = by_chance(bench, replays, point, replays.noise_floor(held, point, noise))
     drawn = replays.residuals(_drawn(point, covariance))
     of_parameters = drawn[np.arange(len(rows)) % IMITATED, np.arange(len(rows))] - residuals[-1]
-    of_parameters = np.where(np.isfinite(of_parameters), of_parameters, 0.0)
-    return np.concatenate([residuals, chance + of_parameters]), rows
+    finer = replace(replays, simulator=_finer(bench)).residuals(point[None])[0]
+    return np.concatenate(
+        [residuals, chance + _where_finite(of_parameters) + _where_finite(finer - residuals[-1])]
+    ), rows
 
 
 def _from_fitted(
@@ -206,7 +210,7 @@ def _from_fitted(
 ) -> tuple[Float[np.ndarray, "models windows steps channels"], Int[np.ndarray, " windows"]] | None:
     """The same from starts that are fitted under each model to the strides before, and of the imitated hold-out."""
     moving, of_models, rows = stride(bench.problem.dataset), [], np.empty(0, np.int64)
-    of_window = replay_steps(bench.states, moving, 0) * 4 // 5 + (4 + IMITATED) * steps
+    of_window = replay_steps(bench.states, moving, 0) * 4 // 5 + (4 + IMITATED + FINER) * steps
     most = bench.windows_in_time(of_window, SHARE, MOST)
     most_steps = bench.steps_in_time(most * of_window, SHARE)
     for simulator, points in _models(bench, given, point):
@@ -238,7 +242,8 @@ def _imitated(
 
     Its windows begin where the log's do, at `states`. Its parameters are a few for all windows (`_drawn`), random
     `forces` act on it, and its sensors have the noise that the estimate's `residuals` of fitted readings have. What is
-    missing in the model then shows in errors of the log that are larger than these (Gelman, Meng and Stern 1996).
+    missing in the model then shows in errors of the log that are larger than these (Gelman, Meng and Stern 1996). It is
+    made with a timestep of a quarter of the length, to first order.
     """
     random, readings, windows = np.random.default_rng(0), replays.readings, np.arange(len(replays.readings))
     drawn = _drawn(point, covariance)
@@ -250,9 +255,23 @@ def _imitated(
     if forces.any() and len(left):
         # What forces did to the fitted readings lasts; noise alone is in the differences of consecutive ones.
         noise = np.minimum(noise, np.sqrt((np.diff(left, axis=1) ** 2).mean((0, 1)) / 2.0))
-    made = np.where(np.isfinite(made), made, 0.0) + noise * random.standard_normal(made.shape)
+    finer = replace(replays, simulator=_finer(bench)).residuals_from(point[None], states[None])[0] - residuals
+    made = _where_finite(made) + _where_finite(finer) + noise * random.standard_normal(made.shape)
     observed = moved(bench.simulator.task.attitudes, readings.observed, made * readings.scale)
     return replace(replays, readings=replace(readings, observed=observed)).residuals(point[None])
+
+
+def _finer(bench: Bench) -> Simulator:
+    """The calibrated model with a timestep of a quarter of the length, where a spec makes it."""
+    task = bench.simulator.task
+    if task.source is None:
+        return bench.simulator
+    return simulation.make(task.with_time_step(1.0 / FINER, substeps=FINER))
+
+
+def _where_finite(values: np.ndarray) -> np.ndarray:
+    """The values, and 0 where a simulation has failed."""
+    return np.where(np.isfinite(values), values, 0.0)
 
 
 def _drawn(point: Float[np.ndarray, " d"], covariance: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "systems d"]:
