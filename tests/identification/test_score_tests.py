@@ -164,3 +164,11 @@ def test_columns_put_together_have_the_products_of_their_sum():
     weights = np.array([[2.0], [-1.0]])
     combined = Products.of(residuals, parameter, columns).combined([1], [2, 3], weights)
     assert combined.each == pytest.approx(Products.of(residuals, parameter, columns @ weights).each)
+
+
+def test_a_column_is_taken_away_from_the_residuals_of_products():
+    residuals, by_value, first, second = np.random.default_rng(0).standard_normal((4, 3, 5))
+    columns = by_value[..., None], np.stack([first, second], axis=-1)
+    less = Products.of(residuals, *columns).less(2, 0.5)
+    np.testing.assert_allclose(less.each, Products.of(residuals + 0.5 * first, *columns).each)
+    assert less.count == 1
