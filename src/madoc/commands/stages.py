@@ -243,12 +243,12 @@ def calibration_text(result: "CalibrationResult") -> tuple[RenderableType, ...]:
     """The verdict, the tables of estimates and of predictions, a summary, and what to do."""
     from madoc.report.words import to_do
 
-    verdict = (str(result.verdict),) if result.verdict else ()
-    advice = (
-        (f"what to do: {to_do(result.verdict.word, converged=result.status == 'converged')}",) if result.verdict else ()
-    )
     predictions = result.predictions()
-    return (*verdict, result.table(), *(() if predictions is None else (predictions,)), result.summary(), *advice)
+    text = (result.table(), *(() if predictions is None else (predictions,)), result.summary())
+    if result.verdict is None:
+        return text
+    advice = to_do(result.verdict.word, converged=result.status == "converged")
+    return (str(result.verdict), *text, f"what to do: {advice}")
 
 
 def calibration_status(result: "CalibrationResult") -> str:

@@ -114,9 +114,8 @@ def suspicions(
     tests = TermTests(products, tuple(tried), simulator.parameters, half_widths, runs[counted])
     beside = tests.less_steps()
     drifts, others = drifts_of(beside, simulator, readings, runs, fit, point, dataset.names_of_runs)
-    smaller = [replace(each, explained=tests.beside_steps * each.explained) for each in _below_minimum(beside, led)]
-    drifts = [replace(each, explained=tests.beside_steps * each.explained) for each in drifts]
-    terms = [*_terms(tests), *smaller, *drifts]
+    of_rest = (*_below_minimum(beside, led), *drifts)
+    terms = [*_terms(tests), *(replace(each, explained=tests.beside_steps * each.explained) for each in of_rest)]
     unlisted, covering = unlisted_forces(tests, families(simulator, responses), readings, fit, by_terms, responses)
     terms, others = [*terms, *unlisted], [*others, *covering]
     for other in _of_other_windows(tests, led - point):
