@@ -19,6 +19,9 @@ class Given(Side):
     def errors(self):
         return self.by_hand[0]
 
+    def off_line(self):
+        return np.zeros_like(self.by_hand[0])
+
     def slopes(self):
         return self.by_hand[1]
 
@@ -97,6 +100,18 @@ def test_errors_are_the_mean_over_both_ends_and_lead_back_to_the_point(above, be
     np.testing.assert_allclose(side.slopes(), [[[3.0 + above + below]]])
     np.testing.assert_allclose(side.errors(), [[mean]])
     np.testing.assert_allclose(side.found.counted(side.found.whitened[0]), [[2.0]])
+
+
+def test_predictions_off_a_line_count_with_more_noise():
+    """By hand: errors 2, -1 at ends 2 + 3 ± 1 and -1 + 0.5 ± 1, off a line by 3 and 0.5: noise of √82, √3.25."""
+    point = known(np.array([2.0, -1.0]).reshape(1, 1, 2, 1))
+    ends = known(np.array([[6.0, 0.5], [4.0, -1.5]]).reshape(2, 1, 2, 1))
+    side = Side(np.zeros((1, 1, 1)), point, ends, np.array([[0.2]]), np.zeros(1), None)
+    np.testing.assert_allclose(side.off_line(), [[9.0, 0.25]])
+    gradients, products, _ = products_of(side, side, np.ones(1, bool), "linear")
+    np.testing.assert_allclose(side.slopes(), [[[10.0], [10.0]]])
+    np.testing.assert_allclose(gradients, [[5.0 * 10.0 / 82.0 - 0.5 * 10.0 / 3.25]])
+    np.testing.assert_allclose(products, [[[100.0 / 82.0 + 100.0 / 3.25]]])
 
 
 def test_steps_are_judged_by_what_chance_makes_of_as_many():

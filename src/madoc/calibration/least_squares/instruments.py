@@ -4,6 +4,10 @@ Where bodies strike each other the cost is rough: it goes up and down with what 
 part of a standard error, and there a derivative does not tell where the minimum is. So errors and derivatives are means
 and differences over points as far apart as parameters are uncertain (statistical linearisation, Gelb 1974, 6.2).
 
+A prediction that is not linear between these points, as where something is just missed, tells little of where the
+minimum is, and its derivatives are the largest. So how far it is off a line counts as noise of that reading (posterior
+linearisation, García-Fernández et al. 2015).
+
 A finite ensemble leaves chance in them, by which a least-squares step would be biased and too short, as both share it.
 So there are two ensembles a and b, drawn independently, and the derivatives of each are instruments for the other
 (Reiersol 1941):
@@ -41,6 +45,9 @@ WIDTHS = (0.005, 0.4)
 WIDER, WIDE = 3.0, 0.02
 """Factor by which differences are wider, up to the second, in [-1, 1]: so near the point predictions are as good as
 linear, and there is less of the ensembles' chance in wider ones."""
+OFF_LINE = 3.0
+"""Standard deviations of noise that a prediction counts with for each that it is off a line: the minimum is farther
+away than the ends of the differences are."""
 LARGEST_SHARE = 0.1
 """Largest share in [0, 1] of the squares of all windows, mean over all directions, that a window counts with."""
 ROUNDS = 10  # of weighting windows of too large a share less
@@ -105,6 +112,11 @@ class Side:
         """Whitened prediction errors at the point: the mean over the differences' ends, led back from theirs to it."""
         return self.found.counted(self.ends.whitened.mean(0)) - self.slopes() @ self.aside
 
+    def off_line(self) -> Float[np.ndarray, "windows values"]:
+        """Mean square over the differences of how far the mean of their ends is from the error at the point."""
+        above, below = np.split(self.ends.whitened, 2)
+        return self.found.counted((((above + below) / 2.0 - self.found.whitened[0]) ** 2).mean(0))
+
     def slopes(self) -> Float[np.ndarray, "windows values d"]:
         """The derivatives of these by the parameters."""
         above, below = np.split(self.ends.whitened, 2)
@@ -122,9 +134,12 @@ def products_of(
     """Each window's gradient of the cost, products of both ensembles' derivatives, and squares of each's own.
 
     They are 0 in a window in which a simulation failed. An ensemble's errors are weighted by their own size alone, so
-    that the other's derivatives share no chance with them.
+    that the other's derivatives share no chance with them. Predictions that are off a line have the noise `OFF_LINE`.
     """
-    errors, slopes = (first.errors()[whole], second.errors()[whole]), (first.slopes()[whole], second.slopes()[whole])
+    sides = first, second
+    noise = np.sqrt(1.0 + OFF_LINE**2 * (first.off_line() + second.off_line())[whole] / 2.0)
+    errors = [each.errors()[whole] / noise for each in sides]
+    slopes = [each.slopes()[whole] / noise[..., None] for each in sides]
     z = [(each / TUNING[loss]) ** 2 for each in errors]
     weights = [loss_slope(each, loss) for each in z]
     both, counted = np.sqrt(weights[0] * weights[1]), np.ones(len(errors[0]))
