@@ -1,6 +1,7 @@
 """Problems whose model is right, in the conditions under which machines are logged."""
 
 from adversary_cases.case import ENCODER, Case, Log, Plant, Robot, Spec
+from adversary_cases.contact_robots import PUSHER, WALKER, WIPER
 from adversary_cases.robots import ARM, BALL, BOX, CART, HULL, LEG, PENDULUM
 
 NO_NOISE = Log(noise=0.0)
@@ -26,6 +27,7 @@ _NOT = {**dict.fromkeys(("ball", "hull", "leg"), ("few", "100hz")), "box": ("few
 """Conditions that a robot does not meet. Integrated five times more finely, the box slides otherwise than the user's
 model can say: at the true values one row's prediction is off by 0.7 typical changes of the speed. That is a deception.
 """
+_OF_CONTACTS = ("plain", "positions", "fine", "fine-exact")
 _LONG = ("length", "damping", "friction", "armature")  # with the gain as well, the log would tell only ratios
 _EIGHT = tuple(ARM.catalogue)
 
@@ -65,5 +67,6 @@ _SPECIAL = (
 HONEST = (
     *(case for robot in (PENDULUM, ARM, CART) for case in usual(robot)),
     *(case for robot in (BOX, BALL, HULL, LEG) for case in usual(robot) if case.name not in _NOT[robot.name]),
+    *(case for robot in (PUSHER, WIPER, WALKER) for case in usual(robot) if case.name in _OF_CONTACTS),
     *_SPECIAL,
 )
