@@ -8,12 +8,12 @@ import pytest
 
 from madoc import robots, simulation
 from madoc.calibration import CalibrationProblem
-from madoc.calibration.least_squares import filtering, instruments
+from madoc.calibration.least_squares import filtering, instruments, left_over
 from madoc.calibration.least_squares.calibrator import LeastSquares
 from madoc.calibration.least_squares.filtering import of_contacts
 from madoc.calibration.least_squares.instruments import Side, agreed, axes_of
 from madoc.calibration.least_squares.lengthening import LeastSquaresState, back_to_filter
-from madoc.calibration.least_squares.sentences import about_surprises
+from madoc.calibration.least_squares.sentences import TIMESTEP, about_surprises
 from madoc.data import stride
 from madoc.identification import random_forces
 from madoc.identification.ensembles import (
@@ -70,14 +70,18 @@ def problem_of_foot(folder, rows=900, spec=FOOT_SPEC, force=0.0):
     """A log whose heights are as noisy as a camera's, many times as deep as the foot sinks in; a random force acts."""
     task = robots.load(write_robot(folder, spec, foot=FOOT)).task
     truth = {"action_delay": 0.01, **FOOT_TRUTH} if task.pending else FOOT_TRUTH
-    log = recorded(task, truth, rows, jax.random.key(0), force)
-    random, logged = np.random.default_rng(0), log.transitions
+    return with_noisy_sensors(task, recorded(task, truth, rows, jax.random.key(0), force))
+
+
+def with_noisy_sensors(task, log, share=1.0):
+    random, logged, noise = np.random.default_rng(0), log.transitions, share * np.array([*NOISE.values()])
     here, there = (np.array(part, np.float64) for part in (logged.observation, logged.next_observation))
-    error = random.standard_normal((len(here) + 1, 4)) * [*NOISE.values()]
+    error = random.standard_normal((len(here) + 1, 4)) * noise
     last = np.isin(np.arange(len(here)), log.episode_ends - 1)
-    following = np.where(last[:, None], random.standard_normal(here.shape) * [*NOISE.values()], error[1:])
+    following = np.where(last[:, None], random.standard_normal(here.shape) * noise, error[1:])
     noisy = replace(logged, observation=here + error[:-1], next_observation=there + following)
-    return CalibrationProblem(replace(log, transitions=noisy), simulation.make(task, threads=1))
+    noisy = replace(log, transitions=noisy, physics=task.physics)
+    return CalibrationProblem(noisy, simulation.make(task, threads=1))
 
 
 def test_likely_states_before_a_window_explain_it_where_narrow_steps_do_not(tmp_path):
@@ -216,7 +220,7 @@ def test_an_epoch_at_rest_tells_what_half_the_ensemble_errs_and_moves_nothing(tm
     covariance = known_well.found.uncertainty.covariance  # of one gradient alone, as there was no scatter before
     np.testing.assert_allclose(covariance, np.array([[1.0, 2.0], [2.0, 4.0]]) / (1e3 * len(told)) ** 2)
     systems = instruments.MEMBERS // 2 + 2 * 2 * len(problem.simulator.parameters) * instruments.FEW
-    large = filtering.LARGE_ROUNDS * filtering.LARGE * search.size
+    large = left_over.LARGE_ROUNDS * left_over.LARGE * search.size
     assert spent == (systems * len(search.rows) + large) * filtering.horizon_of(problem)
 
 
@@ -239,7 +243,7 @@ def test_only_what_a_larger_ensemble_loses_too_counts_as_lost(tmp_path, monkeypa
     assert asked == [search.size, 3]
     assert after.cost == pytest.approx((0.5 * (search.size - 2) + 7.0) / (search.size - 1))
     systems = instruments.MEMBERS // 2 + 2 * 2 * len(problem.simulator.parameters) * instruments.FEW
-    large = filtering.LARGE * (filtering.LARGE_ROUNDS * search.size + filtering.LARGER * 3)
+    large = left_over.LARGE * (left_over.LARGE_ROUNDS * search.size + left_over.LARGER * 3)
     assert spent == (systems * len(search.rows) + large) * filtering.horizon_of(problem)
 
 
@@ -276,9 +280,40 @@ def test_random_forces_are_asked_for_at_the_end_and_found(tmp_path):
     (none, _), _ = counted(filtering.step, without, trial, "cauchy")
     assert none.force == 0.0 and none.settled and none.asked == "known"
     doubtful = back_to_filter(replace(state, filtered=replace(rest, cost=2.0, size=12))).filtered
-    assert doubtful.asked == "size"  # without a trial
+    assert doubtful.asked == "shorter"  # without a trial
+    doubtful = replace(doubtful, asked="size")
     (none, _), _ = counted(filtering.step, without, doubtful, "cauchy")
     assert none.force == 0.0 and none.asked == "known" and none.settled
+
+
+def test_a_shorter_timestep_is_asked_for_where_errors_are_unlike_noise(tmp_path):
+    """A timestep of 10 ms and a plant of 1.25 ms; by the model's own search mass and friction are off by this much."""
+    task = robots.load(write_robot(tmp_path, FOOT_SPEC, foot=FOOT.replace("0.002", "0.01"))).task
+    off, finer = np.array([-0.0825, 0.0547]), task.with_time_step(1.0 / 8.0, substeps=8)
+    problem = with_noisy_sensors(task, recorded(finer, FOOT_TRUTH, 900, jax.random.key(0)), 0.2)
+    search = of_contacts(problem, jax.random.key(0))
+    told = np.broadcast_to(1e4 * np.eye(2), (len(search.rows), 2, 2))
+    point = problem.simulator.parameters.to_unit(problem.simulator.parameters.vector(FOOT_TRUTH)) + off
+    rest = replace(search, point=point, spread=0.02 * np.eye(2), alike=0.4, wide=3, quiet=1, halved=9)
+    rest = replace(rest, together=instruments.TOGETHER, squares=told, products=told)
+    asked = back_to_filter(LeastSquaresState(None, (), "filtering", rest, None)).filtered
+    assert asked.asked == "shorter" and not asked.settled
+    (known, _), spent = counted(filtering.step, problem, asked, "cauchy")
+    assert spent < filtering.epoch_steps(problem, asked)  # which counts each timestep
+    assert known.settled and not known.found.unlike_noise and about_surprises(problem, known) == (TIMESTEP,)
+    np.testing.assert_allclose(known.shorter_steps, -off, atol=0.05)
+    np.testing.assert_array_equal(known.point, point)
+    method = LeastSquares()
+    state = replace(method.init(problem, jax.random.key(0)), stage="filtering", filtered=known, finished=1)
+    moved, still = (
+        method.estimate(problem, replace(state, filtered=replace(known, shorter_steps=each))).interval
+        for each in (np.array([0.1, -0.2]), np.zeros(2))
+    )
+    half = (problem.simulator.parameters.high - problem.simulator.parameters.low) / 2.0
+    np.testing.assert_allclose(moved - still, [[0.0, 0.1 * half[0]], [-0.2 * half[1], 0.0]], atol=1e-12)
+    lacking = problem_of_foot(tmp_path, force=4.0)
+    (left, _), _ = counted(filtering.step, lacking, replace(asked, alike=0.9, size=16), "cauchy")
+    assert left.asked == "size" and left.alike == 0.9 and not left.shorter_steps.any()
 
 
 def test_epochs_near_the_end_take_other_windows_and_count_together(tmp_path):
@@ -301,11 +336,11 @@ def test_epochs_near_the_end_take_other_windows_and_count_together(tmp_path):
 def test_random_forces_are_likelier_only_beyond_two_standard_errors_of_enough_windows():
     """By hand: changes of -1 ± 1 in sixteen windows have a mean of -1 and a standard error of 1.03 / 4."""
     change = np.tile([0.0, -2.0], 8)
-    assert filtering.likelier(change, np.zeros(16), 2)
-    assert not filtering.likelier(change + 0.5, np.zeros(16), 2)  # -0.5 is less than twice 0.258
-    assert filtering.likelier(change + 0.45, np.zeros(16), 2)
-    assert not filtering.likelier(change, np.where(np.arange(16) < 12, np.nan, 0.0), 2)  # four windows do not tell
-    assert filtering.likelier(np.append(change, np.nan), np.zeros(17), 2)  # one that fails does not count
+    assert left_over.likelier(change, np.zeros(16), 2)
+    assert not left_over.likelier(change + 0.5, np.zeros(16), 2)  # -0.5 is less than twice 0.258
+    assert left_over.likelier(change + 0.45, np.zeros(16), 2)
+    assert not left_over.likelier(change, np.where(np.arange(16) < 12, np.nan, 0.0), 2)  # four windows do not tell
+    assert left_over.likelier(np.append(change, np.nan), np.zeros(17), 2)  # one that fails does not count
 
 
 def test_the_largest_random_force_makes_the_typical_change_of_the_speed(tmp_path):

@@ -185,8 +185,9 @@ class LeastSquares:
         mean = space.to_physical(point)
         covariance = half[:, None] * uncertainty.covariance * half
         errors = quantile(found.windows, len(space))
-        width = half * errors * np.sqrt(np.diag(uncertainty.covariance))
-        interval = np.clip(np.stack([mean - width, mean + width], axis=-1), space.low[:, None], space.high[:, None])
+        width, moved = half * errors * np.sqrt(np.diag(uncertainty.covariance)), half * found.shorter_steps
+        ends = np.stack([mean - width + np.minimum(moved, 0.0), mean + width + np.maximum(moved, 0.0)], axis=-1)
+        interval = np.clip(ends, space.low[:, None], space.high[:, None])
         return Estimate(
             mean=mean,
             std=np.sqrt(np.diag(covariance)),

@@ -12,19 +12,17 @@ from dataclasses import replace
 import jax
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
-from scipy.optimize import minimize_scalar
 
 from madoc.calibration.base import CalibrationProblem
-from madoc.calibration.least_squares import instruments
-from madoc.calibration.least_squares.instruments import LIKE_CHANCE, MEMBERS, NEAR, FilterState, Side
-from madoc.calibration.least_squares.plan import FEWEST, LONG_TAILS, touched
+from madoc.calibration.least_squares import instruments, left_over
+from madoc.calibration.least_squares.instruments import LIKE_CHANCE, NEAR, FilterState, Side
+from madoc.calibration.least_squares.plan import FEWEST, touched
 from madoc.data import stride
 from madoc.identification.ensembles import SPOILT, FilteredWindows, next_noise, with_noise
 from madoc.identification.gauss_newton import TRIALS, damped_step
 from madoc.identification.information import sandwich
-from madoc.identification.innovations import Innovations, innovations
+from madoc.identification.innovations import innovations
 from madoc.identification.losses import Loss
-from madoc.identification.random_forces import largest
 from madoc.identification.replay import Readings
 from madoc.identification.settling import FAILED_WINDOW
 from madoc.identification.windows import disjoint_windows, interleaved, rows_that_fit
@@ -67,16 +65,6 @@ FIRST_SEEN, MOST_SEEN = 64, 512
 """Number of windows of which it is asked first whether bodies touch in any, and largest number of which it is asked."""
 MOST_TOLD = 0.9
 """Share in (0, 1) that counts of what a window tells where no other one tells of a direction."""
-LARGE, LARGE_ROUNDS, LARGER = 64, 2, 4
-"""Number of states that tell at the end whether what is left is noise, as few leave errors that are alike, and how
-often noise is estimated by them. Windows that such an ensemble loses are given to one so many times as large."""
-TRIAL, SIZE_ROUNDS = -1.5, 2
-"""Power of ten of the size of random forces, in the largest one, with which it is asked whether any act, and how often
-noise is estimated for a size."""
-SIZES, SMALLEST_SIZE = 8, -3.0
-"""Number of sizes that are tried then, and power of ten of the smallest, in the largest."""
-BETTER = 2.0
-"""Standard errors of the windows' mean by which random forces make readings likelier, as chance does not."""
 
 
 def horizon_of(problem: CalibrationProblem) -> int:
@@ -126,17 +114,22 @@ def of_contacts(
         meat=np.zeros((count, count)),
         apart=np.zeros(count),
         chance=np.zeros((count, count)),
+        shorter_steps=np.zeros(count),
     )
 
 
 def epoch_steps(problem: CalibrationProblem, state: FilterState) -> int:
     """Control steps of the next epoch, but for windows lost in the last one; at rest no step is tried."""
-    if sizes := {"trial": 2, "size": 1 + SIZES}.get(state.asked):
-        return sizes * SIZE_ROUNDS * MEMBERS * min(state.size, len(state.rows)) * state.horizon
+    if members := left_over.members_for(state):
+        return members * min(state.size, len(state.rows)) * state.horizon
     tried, rounds = 0 if state.at_rest else 1 + len(TRIALS), 1 if state.wide else NOISE_ROUNDS
     systems = rounds * state.members + (2 * 2 * len(problem.simulator.parameters) + tried) * instruments.FEW
     windows = len(state.rows[state.block])
-    large = LARGE_ROUNDS * LARGE * min(windows, state.size) if state.at_rest and state.to_compare == 1 else 0
+    large = (
+        left_over.LARGE_ROUNDS * left_over.LARGE * min(windows, state.size)
+        if state.at_rest and state.to_compare == 1
+        else 0
+    )
     return (systems * windows + large) * state.horizon
 
 
@@ -160,9 +153,8 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
     random = [np.random.default_rng([state.seed, state.epochs, number]) for number in range(3)]
     windows = FilteredWindows(problem.dataset, problem.states, problem.simulator, readings, rows)
     some = windows.of(np.arange(min(state.size, len(rows))))
-    if state.asked in ("trial", "size"):
-        tried = with_trial if state.asked == "trial" else with_random_forces
-        return tried(some, state, rounding), Epoch({"moved": state.moved})
+    if left_over.members_for(state):
+        return left_over.with_answer(some, state, rounding, loss), Epoch({"moved": state.moved})
     rounds = 1 if state.wide else NOISE_ROUNDS
     found, _ = with_noise(windows, state.point, state.noise, rounding, count, rounds, random[2], state.force)
     state = replace(state, noise=found.noise)
@@ -185,7 +177,7 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
             failures=failures,
         )
         if following.settled:
-            following = with_what_is_left(some, following, rounding, loss, random[2])
+            following = left_over.with_what_is_left(some, following, rounding, loss, random[2])
         return following, Epoch({"moved": state.moved})
     together = state.together + 1 if state.near else 0
     gradients, products, squares = (
@@ -265,94 +257,3 @@ def _taken(
     elif fails[best] or not change[best].mean() < 0.0:
         return np.zeros_like(target), min(state.damping * DAMPED, DAMPING[1])
     return tried[best], float(np.clip(damping[best], *DAMPING))
-
-
-def with_what_is_left(
-    windows: FilteredWindows,
-    state: FilterState,
-    rounding: Float[np.ndarray, " channels"],
-    loss: Loss,
-    random: np.random.Generator,
-) -> FilterState:
-    """The state with the noise that large ensembles find in some windows, and what errors there have that it has not.
-
-    Spends `LARGE_ROUNDS` · windows · `LARGE` · steps control steps, and those of larger ensembles in windows lost.
-    """
-    found, noise = with_noise(windows, state.point, state.noise, rounding, LARGE, LARGE_ROUNDS, random, state.force)
-    costs = instruments.surprises(found, loss)
-    followed = costs <= LONG_TAILS
-    if (lost := np.flatnonzero(~followed)).size:
-        # An ensemble may lose what it follows by chance. What the model lacks surprises a larger one as well.
-        again, count = windows.of(lost), LARGER * LARGE
-        larger, _ = with_noise(again, state.point, found.noise, rounding, count, 1, random, state.force)
-        costs[lost] = np.minimum(costs[lost], instruments.surprises(larger, loss))
-    share = found.explained_by(windows.readings.actions, followed)
-    return replace(state, noise=noise, cost=instruments.over_windows(costs), alike=found.alike(), explained_share=share)
-
-
-def with_trial(windows: FilteredWindows, state: FilterState, rounding: Float[np.ndarray, " channels"]) -> FilterState:
-    """The state at its end, or with the size of random forces asked for, where some make readings likelier."""
-    size = 10.0**TRIAL * largest(windows.dataset, windows.logged, windows.simulator)
-    none, some = (_tried(windows, state, rounding, each) for each in (0.0, size))
-    pushed = likelier(some.misfit(), none.misfit(), len(state.point))
-    return replace(state, asked="size" if pushed else "known", epochs=state.epochs + 1)
-
-
-def with_random_forces(
-    windows: FilteredWindows, state: FilterState, rounding: Float[np.ndarray, " channels"]
-) -> FilterState:
-    """The state with random forces of the size that makes readings likeliest, and its search to go on with them.
-
-    Where none make them certainly likelier the search is at its end as it was. Every size is tried on the same members;
-    one that makes a simulation fail which does not without forces is too large.
-    """
-    most, tried = largest(windows.dataset, windows.logged, windows.simulator), dict[float, Innovations]()
-    tried[0.0] = _tried(windows, state, rounding, 0.0)
-    without, done = tried[0.0].misfit(), replace(state, asked="known", epochs=state.epochs + 1)
-    whole = np.isfinite(without)
-    if not whole.any():
-        return done
-    costs = {0.0: float(without[whole].mean())}
-
-    def cost(power: float) -> float:
-        size = float(most * 10.0**power)
-        tried[size] = _tried(windows, state, rounding, size)
-        each = tried[size].misfit()[whole]
-        costs[size] = float(each.mean()) if np.isfinite(each).all() else np.inf
-        return costs[size]
-
-    minimize_scalar(cost, bounds=(SMALLEST_SIZE, 0.0), method="bounded", options={"maxiter": SIZES})
-    best = min(costs, key=costs.__getitem__)
-    if not likelier(tried[best].misfit(), without, len(state.point)):
-        return done
-    return replace(
-        done,
-        force=best,
-        noise=tried[best].noise,
-        apart=np.zeros_like(state.apart),
-        chance=np.zeros_like(state.chance),
-        compared=0,
-        moved=NEAR,
-        quiet=0,
-        halved=0,
-        together=0,
-        cost=0.0,
-        alike=0.0,
-        explained_share=0.0,
-    )
-
-
-def _tried(
-    windows: FilteredWindows, state: FilterState, rounding: Float[np.ndarray, " channels"], size: float
-) -> Innovations:
-    """Prediction errors with random forces of a size in N/√kg, and with noise as it then is."""
-    random = np.random.default_rng([state.seed, state.epochs])
-    return with_noise(windows, state.point, state.noise, rounding, MEMBERS, SIZE_ROUNDS, random, size)[0]
-
-
-def likelier(misfits: Float[np.ndarray, " windows"], without: Float[np.ndarray, " windows"], parameters: int) -> bool:
-    """Whether random forces certainly make windows' readings likelier; not where too few are whole to tell."""
-    change = misfits - without
-    change = change[np.isfinite(change)]
-    enough = len(change) >= FEWEST + parameters
-    return enough and bool(change.mean() < -BETTER * change.std(ddof=1) / np.sqrt(len(change)))

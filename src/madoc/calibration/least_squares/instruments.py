@@ -255,9 +255,11 @@ class FilterState:
         together: Number of epochs near the end that the last step was by, 0 before these.
         failures: Number of windows whose simulation failed.
         force: Size of random forces in N/√kg (`random_forces`), 0 until these are looked for.
+        shorter_steps: By how much the parameters move without the timestep's error; 0 where that was not asked, or
+            leaves what is unlike noise too.
         asked: What is asked once the search has settled, and `nothing` before: whether a search from fitted starts
-            leads to `exact` values, by a `trial` whether random forces act, of what `size` they are, and nothing more
-            when that is `known`.
+            leads to `exact` values, whether a `shorter` timestep leaves noise, by a `trial` whether random forces act,
+            of what `size` they are, and nothing more when that is `known`.
         explained_share: Share in [0, 1] of prediction errors, or of random forces, that state and action explain
             (`Innovations.explained_by`); 0 until the end.
     """
@@ -275,6 +277,7 @@ class FilterState:
     meat: Float[np.ndarray, "d d"]
     apart: Float[np.ndarray, " d"]
     chance: Float[np.ndarray, "d d"]
+    shorter_steps: Float[np.ndarray, " d"]
     compared: int = 0
     moved: float = 0.0
     damping: float = FIRST_DAMPING
@@ -287,7 +290,7 @@ class FilterState:
     epochs: int = 0
     failures: int = 0
     force: float = 0.0
-    asked: Literal["nothing", "exact", "trial", "size", "known"] = "nothing"
+    asked: Literal["nothing", "exact", "shorter", "trial", "size", "known"] = "nothing"
     explained_share: float = 0.0
 
     @property
@@ -349,4 +352,6 @@ class FilterState:
         uncertainty = sandwich(bread, self.meat + np.outer(error, error))
         unlike_noise, at_random = self.settled and self.unlike_noise, self.explained_share <= EXPLAINED
         force = self.force if self.settled and at_random else 0.0
-        return Found(self.point, uncertainty, self.explained, self.settled, unlike_noise, force)
+        return Found(
+            self.point, uncertainty, self.explained, self.settled, unlike_noise, force, shorter_steps=self.shorter_steps
+        )

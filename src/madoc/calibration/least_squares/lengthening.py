@@ -238,14 +238,14 @@ def leaves_much_less(search: SearchState, filtered: FilterState) -> bool:
 
 
 def back_to_filter(state: LeastSquaresState) -> LeastSquaresState:
-    """The end of all with the filter's estimate, once it is known whether random forces act.
+    """The end of all with the filter's estimate, once it is known what it leaves.
 
-    The data has noise then, or the model lacks something.
+    The data has noise then, the model's timestep is too long for it, or it lacks something.
     """
     assert state.filtered is not None
     if state.filtered.asked == "known":
         return replace(state, stage="filtering", finished=1)
-    asked: Literal["size", "trial"] = "size" if state.filtered.unlike_noise else "trial"
+    asked: Literal["shorter", "trial"] = "shorter" if state.filtered.unlike_noise else "trial"
     return replace(state, stage="filtering", filtered=replace(state.filtered, asked=asked))
 
 

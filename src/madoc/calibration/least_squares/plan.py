@@ -85,6 +85,8 @@ class Found:
         unlike_noise: Whether residuals have longer tails than noise has, are each like the next, or follow from state
             and action.
         force: Size of random forces in N/√kg (`identification.random_forces`); 0 where none were found.
+        shorter_steps: By how much the parameters move without the timestep's error, where that explains what is unlike
+            noise.
     """
 
     point: Float[np.ndarray, " d"]
@@ -93,6 +95,7 @@ class Found:
     settled: bool
     unlike_noise: bool
     force: float = 0.0
+    shorter_steps: Float[np.ndarray, " d"] | float = 0.0
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,10 @@ NOT_RANDOM = (
     "forces act on the machine that the model does not have, and they are not random: state and action explain {:.0f} "
     "% of one of them; the model lacks something, and the intervals are too narrow, by how much is not known"
 )
+TIMESTEP = (
+    "what the model leaves is unlike noise, but would be noise with a timestep a quarter as long: the intervals also "
+    "cover the estimate without the timestep's error (give a shorter timestep in the spec to narrow them)"
+)
 PUSHED = (
     "random forces that the model does not have act on the machine: in each control step new ones, of which that on {} "
     "has the largest standard deviation, {:.2g} N or N·m (result.json has all, as random_forces); the estimates allow "
@@ -81,11 +85,13 @@ def about_filtered_states(problem: CalibrationProblem, search: FilterState, *, a
 
 
 def about_surprises(problem: CalibrationProblem, search: FilterState) -> tuple[str, ...]:
-    """Sentences on what prediction errors of an ensemble filter have that noise has not, and on random forces."""
+    """Sentences on what an ensemble filter leaves that noise has not, on the timestep, and on random forces."""
     about = [TAILS] * (search.cost > LONG_TAILS) + [ALIKE.format(search.alike)] * (search.alike > WHITE)
     if search.explained_share > EXPLAINED:
         about.append((NOT_RANDOM if search.force else PREDICTABLE).format(100.0 * search.explained_share))
     about *= search.found.unlike_noise
+    if search.shorter_steps.any():
+        about.append(TIMESTEP)
     forces = by_dof(problem.simulator, search.found.force)
     if len(forces):
         largest = int(forces.argmax())

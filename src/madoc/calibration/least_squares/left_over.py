@@ -1,0 +1,194 @@
+"""What the filter's search leaves at its end: noise, the error of a timestep that is too long, or what forces make."""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import minimize_scalar
+
+from madoc import simulation
+from madoc.calibration.least_squares import instruments
+from madoc.calibration.least_squares.instruments import MEMBERS, NEAR, FilterState, Side
+from madoc.calibration.least_squares.plan import FEWEST, LONG_TAILS
+from madoc.identification.candidate_effects import FINER
+from madoc.identification.ensembles import FilteredWindows, with_noise
+from madoc.identification.innovations import Innovations
+from madoc.identification.losses import Loss
+from madoc.identification.random_forces import largest
+
+LARGE, LARGE_ROUNDS, LARGER = 64, 2, 4
+"""Number of states that tell at the end whether what is left is noise, as few leave errors that are alike, and how
+often noise is estimated by them. Windows that such an ensemble loses are given to one so many times as large."""
+TRIAL, SIZE_ROUNDS = -1.5, 2
+"""Power of ten of the size of random forces, in the largest one, with which it is asked whether any act, and how often
+noise is estimated for a size."""
+SIZES, SMALLEST_SIZE = 8, -3.0
+"""Number of sizes that are tried then, and power of ten of the smallest, in the largest."""
+BETTER = 2.0
+"""Standard errors of the windows' mean by which random forces make readings likelier, as chance does not."""
+WHOLE = FINER / (FINER - 1)
+"""What a timestep's error changes over what one shorter by `FINER` does, as the error is in proportion to the step."""
+SHORTER_STEPS = 2
+"""Number of steps of the parameters with the shorter timestep: they begin where the model's own has led."""
+
+
+def members_for(state: FilterState) -> int:
+    """Number of states that the question asked takes of each window, each step of a shorter timestep being one."""
+    step = MEMBERS + 2 * 2 * len(state.point) * instruments.FEW
+    shorter = step + FINER * (SHORTER_STEPS * step + LARGE)
+    return {"shorter": shorter, "trial": 2 * SIZE_ROUNDS * MEMBERS, "size": (1 + SIZES) * SIZE_ROUNDS * MEMBERS}.get(
+        state.asked, 0
+    )
+
+
+def with_answer(
+    windows: FilteredWindows, state: FilterState, rounding: Float[np.ndarray, " channels"], loss: Loss
+) -> FilterState:
+    """The state with the answer to what is asked, and what is asked next.
+
+    Spends `members_for` · windows · steps control steps, where a shorter timestep counts as often as there are more.
+    """
+    if state.asked == "shorter":
+        return with_shorter_steps(windows, state, rounding, loss)
+    return (with_trial if state.asked == "trial" else with_random_forces)(windows, state, rounding)
+
+
+def with_what_is_left(
+    windows: FilteredWindows,
+    state: FilterState,
+    rounding: Float[np.ndarray, " channels"],
+    loss: Loss,
+    random: np.random.Generator,
+    rounds: int = LARGE_ROUNDS,
+) -> FilterState:
+    """The state with the noise that large ensembles find in some windows, and what errors there have that it has not.
+
+    Spends `rounds` · windows · `LARGE` · steps control steps, and those of larger ensembles in windows lost.
+    """
+    found, noise = with_noise(windows, state.point, state.noise, rounding, LARGE, rounds, random, state.force)
+    costs = instruments.surprises(found, loss)
+    followed = costs <= LONG_TAILS
+    if (lost := np.flatnonzero(~followed)).size:
+        # An ensemble may lose what it follows by chance. What the model lacks surprises a larger one as well.
+        again, count = windows.of(lost), LARGER * LARGE
+        larger, _ = with_noise(again, state.point, found.noise, rounding, count, 1, random, state.force)
+        costs[lost] = np.minimum(costs[lost], instruments.surprises(larger, loss))
+    share = found.explained_by(windows.readings.actions, followed)
+    return replace(state, noise=noise, cost=instruments.over_windows(costs), alike=found.alike(), explained_share=share)
+
+
+def with_shorter_steps(
+    windows: FilteredWindows, state: FilterState, rounding: Float[np.ndarray, " channels"], loss: Loss
+) -> FilterState:
+    """The state at its end where a shorter timestep leaves noise, or with random forces asked for where it does not.
+
+    A machine has no timesteps: what those of the model do is like nothing that the machine could lack, and parameters
+    make up for it. Without its error they would have other values, by `shorter_steps` on the same windows.
+    """
+    task = windows.simulator.task.with_time_step(1.0 / FINER, substeps=FINER)
+    shorter = windows._replace(simulator=simulation.make(task))
+    own, finer = _stepped(windows, state, rounding, loss), _stepped(shorter, state, rounding, loss, SHORTER_STEPS)
+    asked = replace(state, asked="size", epochs=state.epochs + 1)
+    if own is None or finer is None:
+        return asked
+    random = np.random.default_rng([state.seed, state.epochs, 3])
+    left = with_what_is_left(shorter, finer, rounding, loss, random, rounds=1)
+    if left.unlike_noise:
+        return asked
+    return replace(
+        asked,
+        asked="known",
+        shorter_steps=WHOLE * (finer.point - own.point),
+        cost=left.cost,
+        alike=left.alike,
+        explained_share=left.explained_share,
+    )
+
+
+def _stepped(
+    windows: FilteredWindows,
+    state: FilterState,
+    rounding: Float[np.ndarray, " channels"],
+    loss: Loss,
+    steps: int = 1,
+) -> FilterState | None:
+    """The state after whole steps of the parameters and of the noise; None where too few simulations are whole."""
+    for step in range(steps):
+        random = [np.random.default_rng([state.seed, state.epochs, step, number]) for number in range(3)]
+        found, noise = with_noise(windows, state.point, state.noise, rounding, MEMBERS, 1, random[2])
+        sides = [Side.of(windows, found, state.point, state.spread, MEMBERS, each) for each in random[:2]]
+        whole = found.whole[0] & sides[0].ends.whole.all(0) & sides[1].ends.whole.all(0)
+        if whole.sum() < FEWEST + len(state.point):
+            return None
+        gradients, products, squares = instruments.products_of(sides[0], sides[1], whole, loss)
+        change = np.linalg.solve(instruments.agreed(products.sum(0), squares.sum(0)), gradients.sum(0))
+        state = replace(state, point=np.clip(state.point - change, -1.0, 1.0), noise=noise)
+    return state
+
+
+def with_trial(windows: FilteredWindows, state: FilterState, rounding: Float[np.ndarray, " channels"]) -> FilterState:
+    """The state at its end, or with the size of random forces asked for, where some make readings likelier."""
+    size = 10.0**TRIAL * largest(windows.dataset, windows.logged, windows.simulator)
+    none, some = (_tried(windows, state, rounding, each) for each in (0.0, size))
+    pushed = likelier(some.misfit(), none.misfit(), len(state.point))
+    return replace(state, asked="size" if pushed else "known", epochs=state.epochs + 1)
+
+
+def with_random_forces(
+    windows: FilteredWindows, state: FilterState, rounding: Float[np.ndarray, " channels"]
+) -> FilterState:
+    """The state with random forces of the size that makes readings likeliest, and its search to go on with them.
+
+    Where none make them certainly likelier the search is at its end as it was. Every size is tried on the same members;
+    one that makes a simulation fail which does not without forces is too large.
+    """
+    most, tried = largest(windows.dataset, windows.logged, windows.simulator), dict[float, Innovations]()
+    tried[0.0] = _tried(windows, state, rounding, 0.0)
+    without, done = tried[0.0].misfit(), replace(state, asked="known", epochs=state.epochs + 1)
+    whole = np.isfinite(without)
+    if not whole.any():
+        return done
+    costs = {0.0: float(without[whole].mean())}
+
+    def cost(power: float) -> float:
+        size = float(most * 10.0**power)
+        tried[size] = _tried(windows, state, rounding, size)
+        each = tried[size].misfit()[whole]
+        costs[size] = float(each.mean()) if np.isfinite(each).all() else np.inf
+        return costs[size]
+
+    minimize_scalar(cost, bounds=(SMALLEST_SIZE, 0.0), method="bounded", options={"maxiter": SIZES})
+    best = min(costs, key=costs.__getitem__)
+    if not likelier(tried[best].misfit(), without, len(state.point)):
+        return done
+    return replace(
+        done,
+        force=best,
+        noise=tried[best].noise,
+        apart=np.zeros_like(state.apart),
+        chance=np.zeros_like(state.chance),
+        compared=0,
+        moved=NEAR,
+        quiet=0,
+        halved=0,
+        together=0,
+        cost=0.0,
+        alike=0.0,
+        explained_share=0.0,
+    )
+
+
+def _tried(
+    windows: FilteredWindows, state: FilterState, rounding: Float[np.ndarray, " channels"], size: float
+) -> Innovations:
+    """Prediction errors with random forces of a size in N/√kg, and with noise as it then is."""
+    random = np.random.default_rng([state.seed, state.epochs])
+    return with_noise(windows, state.point, state.noise, rounding, MEMBERS, SIZE_ROUNDS, random, size)[0]
+
+
+def likelier(misfits: Float[np.ndarray, " windows"], without: Float[np.ndarray, " windows"], parameters: int) -> bool:
+    """Whether random forces certainly make windows' readings likelier; not where too few are whole to tell."""
+    change = misfits - without
+    change = change[np.isfinite(change)]
+    enough = len(change) >= FEWEST + parameters
+    return enough and bool(change.mean() < -BETTER * change.std(ddof=1) / np.sqrt(len(change)))
