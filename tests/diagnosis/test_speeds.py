@@ -32,6 +32,19 @@ def test_an_honest_log_raises_nothing(told, noise):
     assert told(recorded(noise=noise)) == ([], False)
 
 
+def test_speeds_that_shake_faster_than_the_rows_contradict_nothing(told):
+    """The speed's variance is twice that of the motion, so the slope is near a half, and its square the correlation."""
+    columns = recorded()
+    shaken = columns["shoulder_speed"] + columns["shoulder_speed"].std() * np.random.default_rng(0).standard_normal(
+        len(columns["shoulder_speed"])
+    )
+    mean = 0.5 * (shaken[1:] + shaken[:-1])
+    change = np.diff(columns["shoulder"])
+    slope, inverse = speeds._ratios(change, mean * 0.02)
+    assert 0.5 < slope < 0.8 and inverse == pytest.approx(1.0, abs=0.1)
+    assert not [what for _, what in told({**columns, "shoulder_speed": shaken})[0] if "times as fast" in what]
+
+
 @pytest.mark.parametrize(("spacing", "ratio"), [(0.0212, "1.06"), (0.019, "0.95")])
 def test_rows_farther_apart_than_their_times_say(told, spacing, ratio):
     """Positions change by speed times the true spacing, and the time column says 0.02 s."""

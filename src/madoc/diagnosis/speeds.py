@@ -100,13 +100,14 @@ def _compared(pairs: list[_Pair], control_step: float) -> tuple[list[Finding], l
         if turned.any():
             what = f"it jumps by a whole turn in {int(turned.sum())} rows"
             findings.append(Finding("warning", what, pair.position, "unwrap the angle where it is logged"))
-        ratio = _ratio(pair.change[~turned], pair.expected[~turned])
-        if ratio is not None and not _NEAR[0] < ratio < _NEAR[1]:
+        slopes = _ratios(pair.change[~turned], pair.expected[~turned])
+        if slopes is not None and not (slopes[0] < _NEAR[1] and slopes[1] > _NEAR[0]):
+            ratio = slopes[0]
             mistake = unit_mistake(ratio)
             what = f"it changes {ratio:.3g} times as fast as {pair.speed} says" + (f": {mistake}?" if mistake else "")
             remedy = "look at units and signs in the spec and at control_step"
             findings.append(Finding("warning", what, pair.position, remedy, True))
-        elif ratio is not None and not turned.any():
+        elif slopes is not None and not turned.any():
             fit = _fitted(pair, control_step)
             fits += [] if fit is None else [(pair, fit)]
     return findings, fits
@@ -180,12 +181,16 @@ def impacts(change: Float[np.ndarray, " rows"]) -> Bool[np.ndarray, " rows"]:
     return np.abs(apart) > np.maximum(JUMP * median_abs_deviation(apart, scale="normal"), usual)
 
 
-def _ratio(change: Float[np.ndarray, " rows"], expected: Float[np.ndarray, " rows"]) -> float | None:
-    """The slope of the changes by the expected ones; None where they hardly correlate."""
-    power, together = float(expected @ expected), float(change @ expected)
-    if power == 0.0 or not np.any(change) or together**2 < _TRUSTED * power * float(change @ change):
+def _ratios(change: Float[np.ndarray, " rows"], expected: Float[np.ndarray, " rows"]) -> tuple[float, float] | None:
+    """The slope of the changes by the expected ones, and of the inverse regression; None where they hardly correlate.
+
+    What speeds have that does not move the position, as noise or what shakes faster than the rows, makes the first too
+    small and leaves the second.
+    """
+    power, together, changed = float(expected @ expected), float(change @ expected), float(change @ change)
+    if power == 0.0 or changed == 0.0 or together**2 < _TRUSTED * power * changed:
         return None
-    return together / power
+    return together / power, changed / together
 
 
 def unit_mistake(ratio: float) -> str:
