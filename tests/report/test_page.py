@@ -95,7 +95,7 @@ def test_a_hold_out_is_told_by_its_own_measure(whole):
     assert [name for _, name in held["legend"]][-1] == "estimate: 0.1"
     file = whole / "calibration" / "result.json"
     stored = json.loads(file.read_text())
-    common = {name: value for name, value in stored["holdout"].items() if name not in ("errors", "beside_random")}
+    common = {name: value for name, value in stored["holdout"].items() if name != "errors"}
     errors = {"errors": stored["holdout"]["errors"]}
     areas = {
         "area_at_mid_range": {"area": 0.9, "interval": [0.8, 0.95], "rows": 100},

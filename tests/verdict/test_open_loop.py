@@ -16,7 +16,7 @@ from madoc.identification.windows import evenly, rows_that_fit
 from madoc.simulation.write import nominal_values
 from madoc.verdict import Bench
 from madoc.verdict import open_loop as module
-from madoc.verdict.mismatch import BEYOND_RANDOM
+from madoc.verdict.judge import BEYOND_RANDOM
 from madoc.verdict.open_loop import MOST, as_given, beyond_imitated, open_loop
 from madoc.verdict.statistics import ABOVE_NOISE
 from own_robots import SPRING_SPEC, write_robot

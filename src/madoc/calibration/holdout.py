@@ -237,14 +237,8 @@ class JudgedByErrors(Judged):
 
 @dataclass(frozen=True, kw_only=True)
 class Predicted(JudgedByErrors):
-    """Windows of the hold-out replayed from logged states, where states can be computed from the log.
+    """Windows of the hold-out replayed from logged states, where states can be computed from the log."""
 
-    Attributes:
-        beside_random: By signal, how many times as large errors of the longest horizon are, at the best parameters
-            nearby, as sensor noise and random forces of each step make them; the lower end of a 95 % interval.
-    """
-
-    beside_random: dict[str, float] = field(default_factory=dict)
     measure: Literal["predicted"] = "predicted"
 
 

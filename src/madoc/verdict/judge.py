@@ -16,7 +16,6 @@ from madoc.identification.missing_terms import OTHER_WINDOWS
 from madoc.identification.term_tests import named
 from madoc.verdict.adequacy import is_certain, numerical
 from madoc.verdict.mismatch import (
-    BEYOND_RANDOM,
     SEPARABLE,
     at_most,
     change_of,
@@ -47,6 +46,9 @@ WORSE_SIGNAL = 1.1
 """Error of one signal over that of the model as given, above which the sentence names it if it is beyond noise."""
 NAMED = 3
 """Largest number of such signals that are named."""
+BEYOND_RANDOM = 1.3
+"""Lower end of the 95 % interval of a signal's error over that of noise, random forces and uncertainty; above it there
+is something that is none of these."""
 LEAST_EXPLAINED = 1e-3
 """Share in [0, 1] of the squared residuals; a term that is certain and explains less may stand for what the noise of
 initial states does at contacts, as in an honest log of a puck (0.013 %)."""

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from madoc.calibration.holdout import Area, Fitted, HoldOut, Predicted, PredictionErrors, ToldApart, Verdict
+from madoc.calibration.holdout import Area, Fitted, HoldOut, PredictionErrors, ToldApart, Verdict
 from madoc.identification.candidate_terms import UNLISTED
 from madoc.identification.drifts import ONE_RUN, WITHIN_RUNS, is_change
 from madoc.identification.term_tests import MissingTerm, named
@@ -12,9 +12,6 @@ from madoc.verdict.adequacy import about_timestep, as_likely, far_beyond_noise, 
 from madoc.verdict.remedies import WARM_UP, addition, is_of_spec, remedy, value_of
 from madoc.verdict.statistics import NEGLIGIBLE
 
-BEYOND_RANDOM = 1.3
-"""Lower end of the 95 % interval of a signal's error over that of noise and random forces; above it something adds up
-that is not random."""
 _MOST_NAMED = 3
 """Largest number of terms that a sentence names beside the likeliest."""
 SEPARABLE = 0.65
@@ -170,10 +167,11 @@ def _unlike_noise(holdout: HoldOut) -> Verdict | None:
 def _mismatch(holdout: HoldOut) -> Verdict | None:
     if numerical(holdout.missing_terms) is not None:
         return None
+    sentence = ""
     if isinstance(holdout, ToldApart):
         sentence = _separable(holdout)
-    else:
-        sentence = _adding_up(holdout) if isinstance(holdout, Predicted) else _from_fitted_starts(holdout)
+    elif isinstance(holdout, Fitted):
+        sentence = _from_fitted_starts(holdout)
     if not sentence:
         return None
     return Verdict("MODEL_MISMATCH", f"{sentence}{about_timestep(holdout)}", holdout.at_end)
@@ -196,18 +194,6 @@ def _from_fitted_starts(holdout: Fitted) -> str:
         f"the model cannot explain the data: after {in_rows(left.steps)} from a fitted start even the parameters "
         f"nearby that fit the hold-out best err by {left.mean:.2g} of what a signal changes in "
         f"{in_rows(errors.stride)}, {much} ({change_of(errors)}){_where(holdout)}{_at_end(holdout)}"
-    )
-
-
-def _adding_up(holdout: Predicted) -> str:
-    """Which signal's error over the longest horizon is larger than noise and random forces make it; else empty."""
-    signal, factor = max(holdout.beside_random.items(), key=lambda pair: pair[1], default=("", 0.0))
-    if factor <= BEYOND_RANDOM:
-        return ""
-    return (
-        f"the model cannot explain the data: after {in_rows(holdout.errors.nearby_best[-1].steps)} the best parameters "
-        f"nearby leave at least {factor:.2g} times the error in {signal} that sensor noise and random forces make "
-        f"({change_of(holdout.errors)}){_where(holdout)}{_at_end(holdout)}"
     )
 
 

@@ -19,7 +19,6 @@ from madoc.verdict.prediction import Replays, nearby_best
 from madoc.verdict.records import judged
 from madoc.verdict.statistics import (
     NEGLIGIBLE,
-    beside_random,
     best_of,
     hides_gain,
     independent_groups,
@@ -40,14 +39,8 @@ def predicted(bench: Bench, point: Float[np.ndarray, " d"], interval: Float[np.n
     found = _replayed(bench, point)
     best, single = found.best, found.single
     systems = {"the simulator at mid-range": np.zeros(len(point)), "the simulator at the best parameters nearby": best}
-    beside = _beside_random(bench, found)
-    record = partial(
-        Predicted,
-        errors=found.errors,
-        beside_random=dict(zip(bench.simulator.task.signal_names, beside.tolist(), strict=True)),
-    )
     return judged(
-        record,
+        partial(Predicted, errors=found.errors),
         bench,
         point,
         interval,
@@ -111,24 +104,17 @@ def _without(
 
 
 class _Replayed(NamedTuple):
-    """What replays of the hold-out leave at an estimate, and at the `best` parameters nearby.
-
-    Residuals are in typical changes of a stride, of shape (windows, steps, observation); `noisy` are those that noise
-    alone would cause at the best parameters.
-    """
+    """What replays of the hold-out leave at an estimate, and at the `best` parameters nearby."""
 
     errors: PredictionErrors
     best: Float[np.ndarray, " d"]
-    at_best: Float[np.ndarray, "windows steps observation"]
-    noisy: Float[np.ndarray, "windows steps observation"]
     single: "_SingleSteps"
 
 
 def _replayed(bench: Bench, point: Float[np.ndarray, " d"]) -> _Replayed:
     replays = bench.replays
     points = np.concatenate([np.zeros((1, len(point))), point[None], nearby_best(replays, point)])
-    residuals = replays.residuals(points)
-    sizes = replays.magnitudes(residuals)
+    sizes = replays.magnitudes(replays.residuals(points))
     best = best_of(sizes)
     single = _single_steps(bench, points[best])
     noisy = replays.noise_floor(bench.held_out, points[best], single.noise)
@@ -141,16 +127,7 @@ def _replayed(bench: Bench, point: Float[np.ndarray, " d"]) -> _Replayed:
         horizons=replays.horizons,
         stride=stride(bench.problem.dataset),
     )
-    return _Replayed(errors, points[best], residuals[best], noisy[0], single)
-
-
-def _beside_random(bench: Bench, found: _Replayed) -> Float[np.ndarray, " observation"]:
-    """The errors of each signal after the longest horizon over those of chance."""
-    replays = bench.replays
-    random = by_chance(bench, replays, found.best, found.noisy[None])
-    left, chance = (replays.magnitudes(each)[:, 0, -1] for each in (found.at_best[None], random))
-    groups = independent_groups(replays.episodes, replays.rows, replays.windows.steps)
-    return beside_random(left, chance, groups)
+    return _Replayed(errors, points[best], single)
 
 
 def by_chance(
