@@ -256,7 +256,11 @@ def test_random_forces_are_asked_for_at_the_end_and_found(tmp_path):
     search = replace(search, point=truth, noise=np.array([*NOISE.values()]) / problem.typical_change)
     rest = replace(search, wide=3, quiet=1, together=instruments.TOGETHER, squares=told, halved=9)
     state = back_to_filter(LeastSquaresState(None, (), "filtering", rest, None))
-    assert state.filtered.asked == "trial" and not state.filtered.settled and not state.finished
+    assert state.filtered.asked == "shorter" and not state.filtered.settled and not state.finished
+    (trial, _), spent = counted(filtering.step, problem, state.filtered, "cauchy")
+    assert trial.asked == "trial" and not trial.shorter_steps.any()  # the log is of the model's own timestep
+    assert spent < filtering.epoch_steps(problem, state.filtered)  # which counts each timestep
+    state = replace(state, filtered=replace(trial, epochs=state.filtered.epochs))  # and so the same ensembles follow
     exact = replace(state.filtered, asked="exact", cost=2.0)  # before a search from fitted starts has had its steps
     assert not exact.settled and not exact.found.unlike_noise
     (tried, _), spent = counted(filtering.step, problem, state.filtered, "cauchy")

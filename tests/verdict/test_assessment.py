@@ -12,6 +12,7 @@ from planted_logs import ROBOTS, log_of
 import madoc
 from madoc import robots, simulation
 from madoc.calibration import CalibrationProblem, CalibrationResult, LeastSquares
+from madoc.calibration.least_squares import timestep
 from madoc.data.dataset import hold_out
 from madoc.data.findings import Finding
 from madoc.errors import MadocError
@@ -99,7 +100,10 @@ def test_other_rates_of_rows_count_unless_the_estimate_moves_so(result, split, m
     np.testing.assert_allclose(asked[0][2], result.mean)
 
 
-def test_a_log_of_a_finer_simulation_is_judged_beside_that_error_and_its_truth_is_covered(tmp_path):
+@pytest.mark.parametrize("tried", [False, True])
+def test_a_log_of_a_finer_simulation_is_judged_with_its_timestep_or_beside_the_error(tmp_path, monkeypatch, tried):
+    if not tried:
+        monkeypatch.setattr(timestep, "_worth_trying", lambda *_: False)
     task = robots.load(write_robot(tmp_path, SPRING_SPEC)).task
     log = recorded(task.with_time_step(0.25, substeps=4), SPRING_TRUTH, 500, jax.random.key(0))
     parts = hold_out(log, 0.2, jax.random.key(0))
@@ -107,10 +111,15 @@ def test_a_log_of_a_finer_simulation_is_judged_beside_that_error_and_its_truth_i
     estimate = madoc.calibrate(LeastSquares(), problem, key=jax.random.key(0), budget=100_000)
     found = madoc.assess(estimate, parts.held)
     assert found.verdict.word == "CALIBRATED"
-    (error,) = (term for term in found.holdout.missing_terms if term.cause == INTEGRATION)
-    assert error.value == pytest.approx(1.0, abs=0.01) and error.explained > 0.99
+    errors = [term for term in found.holdout.missing_terms if term.cause == INTEGRATION]
     space = problem.simulator.parameters
     truth = space.vector(SPRING_TRUTH)
+    assert estimate.timesteps == (4 if tried else 1)
+    if tried:
+        assert not errors
+        np.testing.assert_allclose(estimate.mean, truth, rtol=1e-6)
+    else:
+        assert errors[0].value == pytest.approx(1.0, abs=0.01) and errors[0].explained > 0.99
     low, high = np.asarray(found.result.interval).T
     assert (np.maximum(low - truth, truth - high) < 1e-4 * (space.high - space.low)).all()
 

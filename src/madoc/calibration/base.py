@@ -7,9 +7,11 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
+from madoc import simulation
 from madoc.data import Dataset, typical_change
 from madoc.data.disturbing import row_change
 from madoc.errors import MadocError
+from madoc.identification.candidate_effects import FINER
 from madoc.identification.information import NORMAL_95
 from madoc.identification.noise import difference_noise, rounding_of
 from madoc.identification.states import LoggedStates, probing_rows, states_of
@@ -47,6 +49,12 @@ class CalibrationProblem:
                 f"{shown}; where the data hides velocities, make the simulator of data.observed_task(task, dataset)"
             )
         object.__setattr__(self, "dataset", replace(self.dataset, true_parameters=None))
+
+    @cached_property
+    def with_shorter_timestep(self) -> "CalibrationProblem":
+        """The same problem with `FINER` physics steps in one of the model's."""
+        task = self.simulator.task.with_time_step(1.0 / FINER, substeps=FINER)
+        return CalibrationProblem(self.dataset, simulation.make(task))
 
     @cached_property
     def states(self) -> LoggedStates:
@@ -130,6 +138,7 @@ class Estimate:
         unlike_noise: Whether the model does not explain the log, which the intervals do not count. False where the
             method does not estimate the noise.
         random_forces: By degree of freedom of the model, in its order; empty where none were found that are random.
+        timesteps: Physics steps in one of the model's with which the parameters were estimated.
         group_stability: Mean adjusted Rand index of the groups with those found from resampled states, or proposed in
             other epochs; 1 is the same groups, 0 chance. None where groups were not found from the problem.
         embeddings: One vector for each parameter, close together for those that act alike; None where none was learnt.
@@ -148,6 +157,7 @@ class Estimate:
     unlike_noise: bool = False
     effective: bool = False
     random_forces: Float[np.ndarray, " dof"] = field(default_factory=lambda: np.zeros(0))
+    timesteps: int = 1
     group_stability: float | None = None
     embeddings: Float[np.ndarray, "d latent"] | None = None
 

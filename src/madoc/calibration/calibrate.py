@@ -100,6 +100,7 @@ def calibrate(
         unlike_noise=estimate.unlike_noise,
         effective=estimate.effective,
         random_forces=dict(zip(dof_names(problem.simulator.task), forces, strict=True)) if forces else {},
+        timesteps=estimate.timesteps,
         group_stability=estimate.group_stability,
         problem=problem,
     )

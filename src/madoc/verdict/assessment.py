@@ -77,6 +77,8 @@ def assess(
             f"expected a simulator with the result's parameters {', '.join(result.parameters)}, got one with "
             f"{', '.join(bench.simulator.parameters.names)}"
         )
+    if bench.timesteps != result.timesteps:
+        bench = replace(bench, timesteps=result.timesteps)
     bench.left_out.clear()
     began, simulated = time.monotonic(), SIMULATED.control_steps
     point = np.clip(bench.simulator.parameters.to_unit(result.mean), -1.0, 1.0)

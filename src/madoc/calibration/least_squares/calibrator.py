@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from madoc.calibration.base import CalibrationProblem, Estimate, at_end_of_range
-from madoc.calibration.least_squares import filtering, lengthening, predicting, sentences
+from madoc.calibration.least_squares import filtering, lengthening, predicting, sentences, timestep
 from madoc.calibration.least_squares.known_starts import KnownStarts
 from madoc.calibration.least_squares.lengthening import LENGTHS, LONGER, READINGS, LeastSquaresState, Stage
 from madoc.calibration.least_squares.plan import EXACT, FEWEST, Found, consecutive_residuals, noisy_rows
@@ -89,17 +89,18 @@ class LeastSquares:
         if stage == "estimated" and filtered is not None:
             stage = "filtering"
         of_starts = named_key(key, "unknown starts")
-        return LeastSquaresState(
+        begun = LeastSquaresState(
             known=None if stage in ("estimated", "filtering") else self._known(problem).init(problem, key),
             unknown=() if stage == "logged" else self._all_lengths(problem, of_starts, filtered=filtered is not None),
             stage=stage,
             filtered=filtered,
             prediction=None if chosen or stage == "filtering" else predicting.windows_for(problem),
         )
+        return replace(begun, of_own=begun)
 
     def step(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[LeastSquaresState, Epoch]:
         """Take one damped step of the current search, and decide which search goes on."""
-        began, windows = SIMULATED.control_steps, (state.stage, state.length)
+        began, windows, given = SIMULATED.control_steps, (state.stage, state.length), _searched(problem, state)
         if state.prediction is not None and state.prediction.progress == "under way":
             prediction, epoch = predicting.step(problem, state.prediction)
             state = replace(state, prediction=prediction, finished=int(prediction.progress != "under way"))
@@ -109,16 +110,15 @@ class LeastSquares:
                 problem, replace(state, filtered=by_filter), self._unknown(problem).horizon
             )
         elif state.estimates_starts:
-            search, epoch = self._unknown(problem, state.length).step(problem, state.unknown[state.length])
+            search, epoch = self._unknown(problem, state.length).step(given, state.unknown[state.length])
             if state.filtered is not None and not lengthening.leaves_much_less(search, state.filtered):
                 state = lengthening.back_to_filter(lengthening.with_search(state, 0, search))
             else:
-                state = self._then_predicting(
-                    problem, self._after_unknown(problem, lengthening.with_search(state, state.length, search))
-                )
+                state = lengthening.with_search(state, state.length, search)
+                state = self._then_predicting(problem, self._after_unknown(problem, state))
         else:
             assert state.known is not None
-            search, epoch = self._known(problem).step(problem, state.known)
+            search, epoch = self._known(problem).step(given, state.known)
             state = self._then_predicting(problem, self._after_known(problem, replace(state, known=search)))
         converged = "another iteration would hardly change any estimate" if state.finished else None
         steps, following = SIMULATED.control_steps - began, self._following(problem, state, windows)
@@ -136,7 +136,13 @@ class LeastSquares:
         return None if state.known is None else self._known(problem).epoch_steps(problem, state.known)
 
     def _then_predicting(self, problem: CalibrationProblem, state: LeastSquaresState) -> LeastSquaresState:
-        """Begin the fit for prediction once the searches have ended, if they left more than noise."""
+        """Once the searches have ended, try a shorter timestep; then fit for prediction if they left more than noise.
+
+        Predictions are those of the model's own timestep.
+        """
+        state = timestep.followed(
+            problem, state, self._unknown(problem).horizon, lambda of: self._with_model_errors(problem, of) is not None
+        )
         prediction = state.prediction
         if not state.finished or prediction is None or not self._leaves_more_than_noise(problem, state):
             return state
@@ -170,13 +176,21 @@ class LeastSquares:
             uncertainty=sandwich(spread.bread, spread.meat),
             windows=windows,
             settled=settled,
-            unlike_noise=settled and state.estimates_starts and sentences.have_long_tails(problem, best),
+            unlike_noise=settled and state.estimates_starts and self._unlike_noise(problem, state),
         )
+
+    def _unlike_noise(self, problem: CalibrationProblem, state: LeastSquaresState) -> bool:
+        """Whether residuals have longer tails than noise, or add up over longer windows with either timestep."""
+        adding_up = state.timesteps > 0 and self._with_model_errors(problem, state) is not None
+        return adding_up or sentences.have_long_tails(problem, self._fitted(state))
 
     def estimate(self, problem: CalibrationProblem, state: LeastSquaresState) -> Estimate:
         """The best search's point, with its sandwich covariance and intervals of Student's t."""
+        state = state.answer
         space, found = problem.simulator.parameters, self._found(problem, state)
         notes, about = self._told(problem, state)
+        if state.timesteps > 1:
+            notes = (*notes, sentences.about_timestep(problem))
         point, uncertainty = found.point, found.uncertainty
         prediction, progress = state.prediction, state.prediction.progress if state.prediction else "not begun"
         if prediction is not None and progress == "better":
@@ -208,6 +222,7 @@ class LeastSquares:
             unlike_noise=found.unlike_noise,
             effective=progress == "better",
             random_forces=by_dof(problem.simulator, found.force),
+            timesteps=max(1, state.timesteps),
         )
 
     def whole_run(self, problem: CalibrationProblem, state: LeastSquaresState, *, refining_epochs: int) -> int:
@@ -342,7 +357,7 @@ class LeastSquares:
         if not state.estimates_starts:
             if float(np.sqrt(best.cost[0])) < EXACT:
                 return False
-            before, after = consecutive_residuals(problem, best.point[0], best.rows)
+            before, after = consecutive_residuals(_searched(problem, state), best.point[0], best.rows)
             return alternation(before, -after) > 0.0
         tried = [length for length in range(LONGER, len(state.unknown)) if state.unknown[length].epochs]
         noise = all(self._noise_alone(problem, state, length) for length in tried)
@@ -374,3 +389,8 @@ class LeastSquares:
             elif (longer := self._with_model_errors(problem, state)) is not None:
                 about = (*about, sentences.about_model_errors(self._unknown(problem, longer).horizon))
         return notes, about
+
+
+def _searched(problem: CalibrationProblem, state: LeastSquaresState) -> CalibrationProblem:
+    """The problem with the timestep of the searches."""
+    return problem.with_shorter_timestep if state.trying or state.timesteps > 1 else problem

@@ -35,7 +35,7 @@ SHORTER_STEPS = 2
 def members_for(state: FilterState) -> int:
     """Number of states that the question asked takes of each window, each step of a shorter timestep being one."""
     step = MEMBERS + 2 * 2 * len(state.point) * instruments.FEW
-    shorter = step + FINER * (SHORTER_STEPS * step + LARGE)
+    shorter = MEMBERS + step + FINER * (MEMBERS + SHORTER_STEPS * step + (LARGE if state.unlike_noise else 0))
     return {"shorter": shorter, "trial": 2 * SIZE_ROUNDS * MEMBERS, "size": (1 + SIZES) * SIZE_ROUNDS * MEMBERS}.get(
         state.asked, 0
     )
@@ -80,29 +80,38 @@ def with_what_is_left(
 def with_shorter_steps(
     windows: FilteredWindows, state: FilterState, rounding: Float[np.ndarray, " channels"], loss: Loss
 ) -> FilterState:
-    """The state at its end where a shorter timestep leaves noise, or with random forces asked for where it does not.
+    """The state with what a shorter timestep changes, where the log is likelier with it, and with what is asked next.
 
     A machine has no timesteps: what those of the model do is like nothing that the machine could lack, and parameters
-    make up for it. Without its error they would have other values, by `shorter_steps` on the same windows.
+    make up for it. Without its error they would have other values, by `shorter_steps` on the same windows. Errors that
+    are unlike noise and stay so have another cause.
     """
-    task = windows.simulator.task.with_time_step(1.0 / FINER, substeps=FINER)
-    shorter = windows._replace(simulator=simulation.make(task))
+    following = replace(state, asked="size" if state.unlike_noise else "trial", epochs=state.epochs + 1)
+    task = windows.simulator.task
+    if task.source is None:
+        return following
+    shorter = windows._replace(simulator=simulation.make(task.with_time_step(1.0 / FINER, substeps=FINER)))
     own, finer = _stepped(windows, state, rounding, loss), _stepped(shorter, state, rounding, loss, SHORTER_STEPS)
-    asked = replace(state, asked="size", epochs=state.epochs + 1)
     if own is None or finer is None:
-        return asked
+        return following
+    if not likelier(_misfit(shorter, finer, rounding), _misfit(windows, own, rounding), len(state.point)):
+        return following
+    following = replace(following, shorter_steps=WHOLE * (finer.point - own.point))
+    if not state.unlike_noise:
+        return following
     random = np.random.default_rng([state.seed, state.epochs, 3])
     left = with_what_is_left(shorter, finer, rounding, loss, random, rounds=1)
     if left.unlike_noise:
-        return asked
-    return replace(
-        asked,
-        asked="known",
-        shorter_steps=WHOLE * (finer.point - own.point),
-        cost=left.cost,
-        alike=left.alike,
-        explained_share=left.explained_share,
-    )
+        return replace(following, shorter_steps=np.zeros_like(state.point))
+    return replace(following, asked="known", cost=left.cost, alike=left.alike, explained_share=left.explained_share)
+
+
+def _misfit(
+    windows: FilteredWindows, state: FilterState, rounding: Float[np.ndarray, " channels"]
+) -> Float[np.ndarray, " windows"]:
+    """Misfit of each window's readings, the noise being that of this point."""
+    random = np.random.default_rng([state.seed, state.epochs, 4])
+    return with_noise(windows, state.point, state.noise, rounding, MEMBERS, 1, random)[0].misfit()
 
 
 def _stepped(

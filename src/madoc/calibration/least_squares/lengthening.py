@@ -72,6 +72,10 @@ class LeastSquaresState:
         length: Index of the unknown search in progress.
         best: Index of the unknown search that has the estimate.
         finished: 1 once the next step would be too small to matter, else 0.
+        timesteps: Physics steps in one of the model's, once it is known with which the log is likelier; 0 before.
+        trying: 1 while a shorter timestep is on trial, else 0.
+        of_own: The state of the searches with the model's own timestep meanwhile, itself without one; before and after,
+            any of the same layout.
     """
 
     known: SearchState | None
@@ -82,6 +86,14 @@ class LeastSquaresState:
     length: int = 0
     best: int = 0
     finished: int = 0
+    timesteps: int = 0
+    trying: int = 0
+    of_own: "LeastSquaresState | None" = None
+
+    @property
+    def answer(self) -> "LeastSquaresState":
+        """The state that has the estimate: with the model's own timestep as long as a shorter one is on trial."""
+        return self.of_own if self.trying and self.of_own is not None else self
 
     @property
     def estimates_starts(self) -> bool:
@@ -240,13 +252,12 @@ def leaves_much_less(search: SearchState, filtered: FilterState) -> bool:
 def back_to_filter(state: LeastSquaresState) -> LeastSquaresState:
     """The end of all with the filter's estimate, once it is known what it leaves.
 
-    The data has noise then, the model's timestep is too long for it, or it lacks something.
+    The data has noise then, the model's timestep is too long for it, random forces act, or it lacks something.
     """
     assert state.filtered is not None
     if state.filtered.asked == "known":
         return replace(state, stage="filtering", finished=1)
-    asked: Literal["shorter", "trial"] = "shorter" if state.filtered.unlike_noise else "trial"
-    return replace(state, stage="filtering", filtered=replace(state.filtered, asked=asked))
+    return replace(state, stage="filtering", filtered=replace(state.filtered, asked="shorter"))
 
 
 def failed(state: LeastSquaresState) -> LeastSquaresState:

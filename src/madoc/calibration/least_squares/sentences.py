@@ -9,6 +9,7 @@ from madoc.calibration.least_squares.plan import EXACT, LONG_TAILS
 from madoc.calibration.least_squares.search import SearchState
 from madoc.data import stride
 from madoc.data.velocities import dof_names
+from madoc.identification.candidate_effects import FINER
 from madoc.identification.noise import WHITE
 from madoc.identification.random_forces import by_dof
 from madoc.identification.systematic import EXPLAINED
@@ -31,8 +32,8 @@ NOT_RANDOM = (
     "% of one of them; the model lacks something, and the intervals are too narrow, by how much is not known"
 )
 TIMESTEP = (
-    "what the model leaves is unlike noise, but would be noise with a timestep a quarter as long: the intervals also "
-    "cover the estimate without the timestep's error (give a shorter timestep in the spec to narrow them)"
+    "the log is likelier with a timestep a quarter as long: the intervals also cover the estimate without the error of "
+    "the model's timestep (give a shorter one in the spec to narrow them)"
 )
 PUSHED = (
     "random forces that the model does not have act on the machine: in each control step new ones, of which that on {} "
@@ -115,6 +116,16 @@ def _how_large(problem: CalibrationProblem, noise: Float[np.ndarray, " channels"
     rows = stride(problem.dataset)
     change = "a step's typical change" if rows == 1 else f"the typical change in {rows} steps"
     return f"the noise found is {100.0 * float(np.median(noise)):.2g} % of {change}"
+
+
+def about_timestep(problem: CalibrationProblem) -> str:
+    """A sentence that the parameters are those of a shorter timestep than the model's."""
+    own = float(problem.simulator.task.model.opt.timestep)
+    return (
+        f"the log is likelier with a timestep of {own / FINER:.12g} s than with the model's of {own:.12g} s, so the "
+        "parameters were estimated and tested with the shorter one, and do not make up for the error of the longer; "
+        "predictions are those of the model's own timestep"
+    )
 
 
 def have_long_tails(problem: CalibrationProblem, search: SearchState) -> bool:
