@@ -192,7 +192,7 @@ def test_a_wrong_model(columns, checked, tmp_path):
     assert found.fatal
     level, where, what = findings[0]
     assert (level, where) == ("fatal", "the model")
-    assert "shoulder_speed, elbow_speed 1, 5 or 20 steps ahead better than 'nothing changes' does" in what
+    assert "shoulder_speed, elbow_speed 1, 5 or 20 rows ahead better than 'nothing changes' does" in what
 
 
 def test_hidden_speeds_are_told_and_intervals_still_expected(robot, columns, checked, tmp_path):

@@ -209,7 +209,7 @@ def _explanation_table(explanation: Explanation, signals: list[str]) -> Table:
         for where in ("mid-range", f"best of {len(explanation.draws)} draws")
         for heading in (f"{where}: {first}", *others)
     ]
-    table = _table(f"prediction errors {ahead} steps ahead, in % of what 'nothing changes' errs", ("signal",), numbers)
+    table = _table(f"prediction errors {ahead} rows ahead, in % of what 'nothing changes' errs", ("signal",), numbers)
     for at, name in enumerate(signals):
         table.add_row(name, *(_percent(value) for draw in both for value in explanation.errors[draw, :, at]))
     table.add_row("all", *(_percent(value) for draw in both for value in explanation.overall[draw]))

@@ -93,7 +93,7 @@ def explanation_findings(
     names = [channel.name for channel in channels if channel.kind == "signal"]
     live = ~np.isnan(explanation.errors).all((0, 1))
     lost = [name for name, error in zip(names, explanation.errors.min((0, 1)), strict=True) if error >= 1.0]
-    better = f"{_ahead(explanation.horizons)} steps ahead better than 'nothing changes' does"
+    better = f"{_ahead(explanation.horizons)} rows ahead better than 'nothing changes' does"
     remedy = "look at its column, sign and unit in the spec, and at the model"
     if lost and len(lost) >= HALF * live.sum():
         what = f"no draw from the box predicts {', '.join(lost)} {better}"

@@ -65,8 +65,8 @@ def _scale_of_masses(names: list[str], *, only_ratios: bool) -> Finding:
         )
         return Finding("warning", what, "parameters", "take one of them out of the spec, at a value that was measured")
     what = (
-        "no log can show whether masses and forces are right together: were the drives' gains and the masses that the "
-        f"model keeps all 10 % off, {listed(names)} would be 10 % off as well, and no interval counts that"
+        "no log can show whether masses and forces are right together: were all gains of drives and all masses that "
+        f"are not calibrated 10 % off, {listed(names)} would be 10 % off as well, and no interval counts that"
     )
     return Finding(
         "note", what, "scale", "weigh a part, or measure a drive's torque, and put that into the model", kept=True
