@@ -259,7 +259,7 @@ def test_random_forces_are_asked_for_at_the_end_and_found(tmp_path):
     assert state.filtered.asked == "shorter" and not state.filtered.settled and not state.finished
     (trial, _), spent = counted(filtering.step, problem, state.filtered, "cauchy")
     assert trial.asked == "trial" and not trial.shorter_steps.any()  # the log is of the model's own timestep
-    assert spent < filtering.epoch_steps(problem, state.filtered)  # which counts each timestep
+    assert spent == filtering.epoch_steps(problem, state.filtered)
     state = replace(state, filtered=replace(trial, epochs=state.filtered.epochs))  # and so the same ensembles follow
     exact = replace(state.filtered, asked="exact", cost=2.0)  # before a search from fitted starts has had its steps
     assert not exact.settled and not exact.found.unlike_noise
@@ -284,13 +284,13 @@ def test_random_forces_are_asked_for_at_the_end_and_found(tmp_path):
     (none, _), _ = counted(filtering.step, without, trial, "cauchy")
     assert none.force == 0.0 and none.settled and none.asked == "known"
     doubtful = back_to_filter(replace(state, filtered=replace(rest, cost=2.0, size=12))).filtered
-    assert doubtful.asked == "shorter"  # without a trial
+    assert doubtful.asked == "shorter"
     doubtful = replace(doubtful, asked="size")
     (none, _), _ = counted(filtering.step, without, doubtful, "cauchy")
     assert none.force == 0.0 and none.asked == "known" and none.settled
 
 
-def test_a_shorter_timestep_is_asked_for_where_errors_are_unlike_noise(tmp_path):
+def test_a_shorter_timestep_that_leaves_noise_explains_errors_that_are_unlike_it(tmp_path):
     """A timestep of 10 ms and a plant of 1.25 ms; by the model's own search mass and friction are off by this much."""
     task = robots.load(write_robot(tmp_path, FOOT_SPEC, foot=FOOT.replace("0.002", "0.01"))).task
     off, finer = np.array([-0.0825, 0.0547]), task.with_time_step(1.0 / 8.0, substeps=8)
@@ -303,7 +303,7 @@ def test_a_shorter_timestep_is_asked_for_where_errors_are_unlike_noise(tmp_path)
     asked = back_to_filter(LeastSquaresState(None, (), "filtering", rest, None)).filtered
     assert asked.asked == "shorter" and not asked.settled
     (known, _), spent = counted(filtering.step, problem, asked, "cauchy")
-    assert spent < filtering.epoch_steps(problem, asked)  # which counts each timestep
+    assert spent == filtering.epoch_steps(problem, asked)
     assert known.settled and not known.found.unlike_noise and about_surprises(problem, known) == (TIMESTEP,)
     np.testing.assert_allclose(known.shorter_steps, -off, atol=0.05)
     np.testing.assert_array_equal(known.point, point)
@@ -315,6 +315,8 @@ def test_a_shorter_timestep_is_asked_for_where_errors_are_unlike_noise(tmp_path)
     )
     half = (problem.simulator.parameters.high - problem.simulator.parameters.low) / 2.0
     np.testing.assert_allclose(moved - still, [[0.0, 0.1 * half[0]], [-0.2 * half[1], 0.0]], atol=1e-12)
+    (like, _), _ = counted(filtering.step, problem, replace(asked, alike=0.0), "cauchy")
+    assert like.asked == "trial" and like.shorter_steps.any()  # the log is likelier, whatever errors are like
     lacking = problem_of_foot(tmp_path, force=4.0)
     (left, _), _ = counted(filtering.step, lacking, replace(asked, alike=0.9, size=16), "cauchy")
     assert left.asked == "size" and left.alike == 0.9 and not left.shorter_steps.any()

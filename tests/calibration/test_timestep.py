@@ -10,8 +10,9 @@ from madoc import calibrate, robots, simulation
 from madoc.calibration import CalibrationProblem
 from madoc.calibration.least_squares import timestep
 from madoc.calibration.least_squares.calibrator import LeastSquares
+from madoc.runs.checkpoint import layout, load, save
 from own_robots import write_robot
-from robots import recorded
+from robots import counted, recorded
 
 ROD = """
 <mujoco>
@@ -72,15 +73,42 @@ def test_a_trial_keeps_the_estimate_until_its_end_and_gives_it_back_if_in_vain(t
     state = method.init(problem, jax.random.key(0))
     while not state.trying:
         own, (state, _) = state, method.step(problem, state)
-    assert state.of_own is not None and not state.finished
     kept = method.estimate(problem, state)
-    tried, _ = method.step(problem, state)
+    np.testing.assert_array_equal(kept.mean, method.estimate(problem, method.step(problem, own)[0]).mean)
+    (tried, epoch), spent = counted(method.step, problem, state)
+    assert epoch.control_steps == spent and spent % timestep.FINER == 0
     assert tried.trying and (tried.unknown[0].point[0] != state.unknown[0].point[0]).any()
     np.testing.assert_array_equal(method.estimate(problem, tried).mean, kept.mean)
     while tried.trying:
         tried, _ = method.step(problem, tried)
-    assert tried.timesteps == 1 and own.timesteps == 0
-    np.testing.assert_array_equal(tried.unknown[0].point, state.of_own.unknown[0].point)
+    assert tried.timesteps == 1 and tried.searched and layout(tried) == layout(state) == layout(own)
+    np.testing.assert_array_equal(method.estimate(problem, tried).mean, kept.mean)
+
+
+def test_a_trial_that_was_stopped_goes_on_to_the_same_bits(tmp_path):
+    problem, method = problem_of(tmp_path, 4), LeastSquares()
+    state = method.init(problem, jax.random.key(0))
+    while not state.trying:
+        state, _ = method.step(problem, state)
+    save(tmp_path / "state.npz", state, {})
+    states = [state, load(tmp_path / "state.npz", method.init(problem, jax.random.key(0)))[0]]
+    problems = problem, problem_of(tmp_path, 4)
+    for _ in range(3):
+        states = [method.step(given, each)[0] for given, each in zip(problems, states, strict=True)]
+    for one, other in zip(*map(jax.tree.leaves, states), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_longer_windows_that_leave_noise_with_a_shorter_timestep_alone_decide(tmp_path):
+    """As likely by the shortest windows, it is taken only where the own adds up and this one is known not to."""
+    problem = problem_of(tmp_path, 1)
+    state = LeastSquares().init(problem, jax.random.key(0))
+    own = replace(state, stage="lengthening", finished=1, of_own=None)
+    tried = replace(own, of_own=own, trying=1)
+    for before, after, timesteps in ((True, False, 4), (True, None, 1), (True, True, 1), (False, False, 1)):
+        said = {id(tried.of_own): before, id(tried): after}
+        found = timestep.followed(problem, tried, 5, lambda of, said=said: said[id(of)])
+        assert (found.timesteps, found.trying) == (timesteps, 0)
 
 
 def test_less_noise_is_likelier_by_as_many_readings_as_tell_it(tmp_path):

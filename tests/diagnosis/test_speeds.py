@@ -33,7 +33,7 @@ def test_an_honest_log_raises_nothing(told, noise):
 
 
 def test_speeds_that_shake_faster_than_the_rows_contradict_nothing(told):
-    """The speed's variance is twice that of the motion, so the slope is near a half, and its square the correlation."""
+    """A mean of two readings has two thirds of its variance from the motion, as much as the slope and r² are."""
     columns = recorded()
     shaken = columns["shoulder_speed"] + columns["shoulder_speed"].std() * np.random.default_rng(0).standard_normal(
         len(columns["shoulder_speed"])

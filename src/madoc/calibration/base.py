@@ -52,9 +52,11 @@ class CalibrationProblem:
 
     @cached_property
     def with_shorter_timestep(self) -> "CalibrationProblem":
-        """The same problem with `FINER` physics steps in one of the model's."""
+        """The same problem with a timestep `FINER` times as short, and the same states of the log."""
         task = self.simulator.task.with_time_step(1.0 / FINER, substeps=FINER)
-        return CalibrationProblem(self.dataset, simulation.make(task))
+        shorter = CalibrationProblem(self.dataset, simulation.make(task))
+        vars(shorter).update(states=self.states, typical_change=self.typical_change)
+        return shorter
 
     @cached_property
     def states(self) -> LoggedStates:
@@ -138,7 +140,7 @@ class Estimate:
         unlike_noise: Whether the model does not explain the log, which the intervals do not count. False where the
             method does not estimate the noise.
         random_forces: By degree of freedom of the model, in its order; empty where none were found that are random.
-        timesteps: Physics steps in one of the model's with which the parameters were estimated.
+        timesteps: Into how many steps each timestep of the model was divided for the estimate.
         group_stability: Mean adjusted Rand index of the groups with those found from resampled states, or proposed in
             other epochs; 1 is the same groups, 0 chance. None where groups were not found from the problem.
         embeddings: One vector for each parameter, close together for those that act alike; None where none was learnt.

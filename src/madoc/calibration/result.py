@@ -71,13 +71,13 @@ class CalibrationResult:
         covariance: Covariance of the estimates in physical units, in the task's order; None where it is unknown.
         combinations: Sums and products of parameters that the log tells though it leaves each of them open.
         settled: False where the method can tell that its search is not at its end; its intervals mean nothing before.
-        unlike_noise: Whether residuals have longer tails than noise has, are each like the next, or follow from state
-            and action.
+        unlike_noise: Whether residuals have longer tails than noise has, add up over longer windows, are each like the
+            next, or follow from state and action.
         effective: Whether the model leaves more than noise, and the estimate is the one that predicts best with it.
         random_forces: Standard deviation of random forces by degree of freedom, in N or N·m, new ones in each control
             step, that act on the machine besides what the model has; empty where none were found that are random.
-        timesteps: Physics steps in one of the model's with which the parameters were estimated: more than one where the
-            log is likelier with a shorter timestep.
+        timesteps: Into how many steps each timestep of the model was divided for the estimate and the tests of what the
+            model lacks: more than one where the log is likelier with a shorter timestep.
         group_stability: How alike groups of resampled states are: their mean adjusted Rand index, 1 for the same
             groups, 0 for chance; None where the method did not find groups.
         chosen: Why `auto` took this method, in a sentence; None where the method was named.

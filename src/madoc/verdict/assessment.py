@@ -77,25 +77,24 @@ def assess(
             f"expected a simulator with the result's parameters {', '.join(result.parameters)}, got one with "
             f"{', '.join(bench.simulator.parameters.names)}"
         )
-    if bench.timesteps != result.timesteps:
-        bench = replace(bench, timesteps=result.timesteps)
+    tested = bench.with_timestep_of(result.timesteps)  # predictions over longer times are the model's as it is
     bench.left_out.clear()
     began, simulated = time.monotonic(), SIMULATED.control_steps
     point = np.clip(bench.simulator.parameters.to_unit(result.mean), -1.0, 1.0)
     bench.tell("predictions of single steps and short windows")
-    fits_starts = _fits_starts(bench, point)
+    fits_starts = _fits_starts(tested, point)
     # Predictions come first where all depends on them: an unsettled search is of use by them alone, and from fitted
     # starts they take much of the time.
     half = (bench.simulator.parameters.high - bench.simulator.parameters.low) / 2.0
     covariance = None if result.covariance is None else result.covariance / np.outer(half, half)
     predict = partial(_predictions, bench, point, fits_starts, covariance, np.array([*result.random_forces.values()]))
     predictions = None if result.settled and not fits_starts else predict()
-    holdout = measured(bench, result.mean, result.interval, fits_starts=fits_starts)
+    holdout = measured(tested, result.mean, result.interval, fits_starts=fits_starts)
     if predictions is None:
         noise = np.array(list(holdout.noise.values())) / bench.change[: len(holdout.noise)]
         predictions = predict(noise)
-    tested, simulated = holdout.tested and LATER not in bench.left_out, SIMULATED.control_steps - simulated
-    holdout = replace(holdout, open_loop=predictions, tested=tested, control_steps=simulated)
+    whole, simulated = holdout.tested and LATER not in bench.left_out, SIMULATED.control_steps - simulated
+    holdout = replace(holdout, open_loop=predictions, tested=whole, control_steps=simulated)
     widened = with_widened_intervals(result, holdout)
     verdict = judge(
         holdout,

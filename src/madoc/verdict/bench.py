@@ -60,8 +60,6 @@ class Bench:
         rate: Control steps that are simulated in a second, which matters under such a limit.
         tell: What is told of each part of the work.
         left_out: What there was no time for so far.
-        timesteps: Physics steps in one of the model's with which an estimate was made, and is tested for what the model
-            lacks. Predictions are those of the model as it is.
 
     Raises:
         MadocError: Too few rows are held out, or they are not of the simulator's robot.
@@ -75,7 +73,6 @@ class Bench:
     rate: float = 1.0
     tell: Callable[[str], None] = lambda part: None
     left_out: list[str] = field(default_factory=list)
-    timesteps: int = 1
 
     def __post_init__(self) -> None:
         if len(self.held_out) < FEWEST_HELD:
@@ -110,7 +107,7 @@ class Bench:
         """About how long testing the model on a window takes, in s."""
         values = len(self.simulator.parameters) + self.simulator.task.model.nv
         steps = STRIDES * stride(self.problem.dataset) * (COLUMNS + COLUMNS_OF_A_VALUE * values)
-        return self.timesteps * steps / self.rate
+        return steps / self.rate
 
     def steps_in_time(self, control_steps: int, share: float) -> int:
         """How many steps of initial states fit into a share of the time left.
@@ -133,10 +130,14 @@ class Bench:
         """The robot, with the ranges of its parameters."""
         return self.problem.simulator
 
-    @property
-    def tested(self) -> Simulator:
-        """The robot that is tested for what it lacks, with the timestep of the estimate."""
-        return self.problem.with_shorter_timestep.simulator if self.timesteps > 1 else self.simulator
+    def with_timestep_of(self, timesteps: int) -> "Bench":
+        """The bench on which an estimate is judged that was made with so many steps in each of the model's timesteps.
+
+        What there is no time for is noted in one place for both.
+        """
+        if timesteps == 1:
+            return self
+        return replace(self, problem=self.problem.with_shorter_timestep, rate=self.rate / timesteps)
 
     @property
     def scaling(self) -> Scaling:

@@ -72,8 +72,8 @@ def judge(
     Args:
         holdout: What the hold-out says of the estimate.
         settled: Whether the search that led to it came to its end.
-        unlike_noise: Whether its residuals have longer tails than noise has, are each like the next, or follow from
-            state and action.
+        unlike_noise: Whether its residuals have longer tails than noise has, add up, are each like the next, or follow
+            from state and action.
         effective: Whether the model leaves more than noise, and the estimate is the one that predicts best with it.
         combinations: What the log tells of parameters that it leaves open.
     """

@@ -23,7 +23,8 @@ def lacking(holdout: HoldOut, *, settled: bool, unlike_noise: bool) -> Verdict |
     """The first of the ways in which a model lacks something; None where there is none.
 
     An end of a range at which a search stands that has not settled says nothing. `unlike_noise` tells that residuals
-    have longer tails than noise has, that each is like the next, or that they follow from state and action.
+    have longer tails than noise has, that they add up, that each is like the next, or that they follow from state and
+    action.
     """
     holdout = holdout if settled else replace(holdout, at_end=(), open_at_end=())
     found = _missing(holdout, missing_term(holdout)) or _mismatch(holdout)

@@ -78,7 +78,7 @@ def _doubts(
     usual = len(windows_of(*given, bench.change, fewest=bench.windows_to_test).rows)
     if shorter == 1 and most is not None and most < usual:
         bench.left_out.append(FEWER)
-    doubts = suspicions(*given, bench.tested, point, half_widths, bench.change, most=most, shorter=shorter)
+    doubts = suspicions(*given, problem.simulator, point, half_widths, bench.change, most=most, shorter=shorter)
     alternatives = in_full((*doubts.alternatives, *of_small_terms(doubts.terms)), doubts.terms)
     return replace(doubts, alternatives=alternatives)
 
@@ -229,11 +229,11 @@ def _richer(
     """The model with a term, and with others in turn, if parameters of a spec add them and there is time for tests."""
     if term is None or not is_of_spec(term) or not doubts.tested:
         return None
-    given = bench.problem.dataset, bench.states, bench.tested, point, half_widths, bench.change
+    given = bench.problem.dataset, bench.states, bench.simulator, point, half_widths, bench.change
 
     def tested(terms: Sequence[MissingTerm]) -> Tested:
         part = f"the model with {' and '.join(each.parameter for each in terms)}"
-        if not bench.begins(part, BEFORE_OTHERS * bench.timesteps * doubts.control_steps / bench.rate):
+        if not bench.begins(part, BEFORE_OTHERS * doubts.control_steps / bench.rate):
             return None
         return richer_model(*given, terms, most=_windows_in_time(bench), shorter=shorter)
 

@@ -1,6 +1,7 @@
 """Least squares from logged states, with unknown initial states, or first the one and then the other."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -15,11 +16,12 @@ from madoc.calibration.least_squares.search import Search, SearchState
 from madoc.calibration.least_squares.unknown_starts import UnknownStarts
 from madoc.data import stride
 from madoc.errors import MadocError
+from madoc.identification.candidate_effects import FINER
 from madoc.identification.information import identifiability, quantile, sandwich
 from madoc.identification.losses import Loss
 from madoc.identification.noise import NOISY, alternation
 from madoc.identification.random_forces import by_dof
-from madoc.simulation.base import SIMULATED
+from madoc.simulation.base import SIMULATED, counted_as
 from madoc.types import Count, Epoch, NotNegative, check_hyperparameters, named_key
 
 InitialStates = Literal["logged", "estimated"]
@@ -100,49 +102,53 @@ class LeastSquares:
 
     def step(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[LeastSquaresState, Epoch]:
         """Take one damped step of the current search, and decide which search goes on."""
-        began, windows, given = SIMULATED.control_steps, (state.stage, state.length), _searched(problem, state)
-        if state.prediction is not None and state.prediction.progress == "under way":
-            prediction, epoch = predicting.step(problem, state.prediction)
-            state = replace(state, prediction=prediction, finished=int(prediction.progress != "under way"))
-        elif state.stage == "filtering" and state.filtered is not None:
-            by_filter, epoch = filtering.step(problem, state.filtered, self.loss)
-            state = lengthening.after_filter(
-                problem, replace(state, filtered=by_filter), self._unknown(problem).horizon
-            )
-        elif state.estimates_starts:
-            search, epoch = self._unknown(problem, state.length).step(given, state.unknown[state.length])
-            if state.filtered is not None and not lengthening.leaves_much_less(search, state.filtered):
-                state = lengthening.back_to_filter(lengthening.with_search(state, 0, search))
-            else:
-                state = lengthening.with_search(state, state.length, search)
-                state = self._then_predicting(problem, self._after_unknown(problem, state))
-        else:
-            assert state.known is not None
-            search, epoch = self._known(problem).step(given, state.known)
-            state = self._then_predicting(problem, self._after_known(problem, replace(state, known=search)))
+        began, windows = SIMULATED.control_steps, (state.stage, state.length, state.trying)
+        with counted_as(FINER if state.trying else 1):
+            state, epoch = self._stepped(problem, state)
         converged = "another iteration would hardly change any estimate" if state.finished else None
         steps, following = SIMULATED.control_steps - began, self._following(problem, state, windows)
         return state, replace(epoch, control_steps=steps, converged=converged, following=following)
 
-    def _following(self, problem: CalibrationProblem, state: LeastSquaresState, was: tuple[Stage, int]) -> int | None:
+    def _stepped(self, problem: CalibrationProblem, state: LeastSquaresState) -> tuple[LeastSquaresState, Epoch]:
+        given = problem.with_shorter_timestep if state.trying else problem
+        if state.prediction is not None and state.prediction.progress == "under way":
+            prediction, epoch = predicting.step(problem, state.prediction)
+            return replace(state, prediction=prediction, finished=int(prediction.progress != "under way")), epoch
+        if state.stage == "filtering" and state.filtered is not None:
+            by_filter, epoch = filtering.step(problem, state.filtered, self.loss)
+            horizon = self._unknown(problem).horizon
+            return lengthening.after_filter(problem, replace(state, filtered=by_filter), horizon), epoch
+        if state.estimates_starts:
+            search, epoch = self._unknown(problem, state.length).step(given, state.unknown[state.length])
+            if state.filtered is not None and not lengthening.leaves_much_less(search, state.filtered):
+                return lengthening.back_to_filter(lengthening.with_search(state, 0, search)), epoch
+            state = lengthening.with_search(state, state.length, search)
+            return self._then_predicting(problem, self._after_unknown(problem, state)), epoch
+        assert state.known is not None
+        search, epoch = self._known(problem).step(given, state.known)
+        return self._then_predicting(problem, self._after_known(problem, replace(state, known=search))), epoch
+
+    def _following(
+        self, problem: CalibrationProblem, state: LeastSquaresState, was: tuple[Stage, int, int]
+    ) -> int | None:
         """About how many control steps the next step simulates, where windows are of the same kind as they were."""
         prediction = state.prediction is not None and state.prediction.progress == "under way"
-        if state.finished or prediction or was != (state.stage, state.length):
+        if state.finished or prediction or was != (state.stage, state.length, state.trying):
             return None
         if state.stage == "filtering" and state.filtered is not None:
             return filtering.epoch_steps(problem, state.filtered)
+        times = FINER if state.trying else 1
         if state.estimates_starts:
-            return self._unknown(problem, state.length).epoch_steps(problem, state.unknown[state.length])
-        return None if state.known is None else self._known(problem).epoch_steps(problem, state.known)
+            return times * self._unknown(problem, state.length).epoch_steps(problem, state.unknown[state.length])
+        return None if state.known is None else times * self._known(problem).epoch_steps(problem, state.known)
 
     def _then_predicting(self, problem: CalibrationProblem, state: LeastSquaresState) -> LeastSquaresState:
         """Once the searches have ended, try a shorter timestep; then fit for prediction if they left more than noise.
 
         Predictions are those of the model's own timestep.
         """
-        state = timestep.followed(
-            problem, state, self._unknown(problem).horizon, lambda of: self._with_model_errors(problem, of) is not None
-        )
+        adds_up = partial(self._adds_up, problem)
+        state = timestep.followed(problem, state, self._unknown(problem).horizon, adds_up)
         prediction = state.prediction
         if not state.finished or prediction is None or not self._leaves_more_than_noise(problem, state):
             return state
@@ -180,21 +186,30 @@ class LeastSquares:
         )
 
     def _unlike_noise(self, problem: CalibrationProblem, state: LeastSquaresState) -> bool:
-        """Whether residuals have longer tails than noise, or add up over longer windows with either timestep."""
-        adding_up = state.timesteps > 0 and self._with_model_errors(problem, state) is not None
-        return adding_up or sentences.have_long_tails(problem, self._fitted(state))
+        """Whether residuals have longer tails than noise, or add up over longer windows."""
+        return bool(self._adds_up(problem, state)) or sentences.have_long_tails(problem, self._fitted(state))
+
+    def _adds_up(self, problem: CalibrationProblem, state: LeastSquaresState) -> bool | None:
+        """Whether longer windows leave more than noise; None where no search on longer ones has settled."""
+        if not state.searched or not state.estimates_starts:
+            return None
+        if self._with_model_errors(problem, state) is not None:
+            return True
+        longer = range(LONGER, len(state.unknown))
+        settled = [each for each in longer if self._unknown(problem).settled(state.unknown[each])]
+        return False if settled else None
 
     def estimate(self, problem: CalibrationProblem, state: LeastSquaresState) -> Estimate:
         """The best search's point, with its sandwich covariance and intervals of Student's t."""
-        state = state.answer
+        tries, state = bool(state.trying), state.answer
         space, found = problem.simulator.parameters, self._found(problem, state)
         notes, about = self._told(problem, state)
-        if state.timesteps > 1:
-            notes = (*notes, sentences.about_timestep(problem))
         point, uncertainty = found.point, found.uncertainty
         prediction, progress = state.prediction, state.prediction.progress if state.prediction else "not begun"
         if prediction is not None and progress == "better":
             point, uncertainty = prediction.best, prediction.of_both(uncertainty)
+        timesteps = 1 if progress == "better" else max(1, state.timesteps)  # such a fit is with the model's own
+        notes = (*notes, sentences.about_timestep(problem)) if timesteps > 1 else notes
         half = (space.high - space.low) / 2.0
         mean = space.to_physical(point)
         covariance = half[:, None] * uncertainty.covariance * half
@@ -212,6 +227,7 @@ class LeastSquares:
                 *at_end_of_range(point, space, space.to_unit(interval.T).T),
                 *(() if found.settled else (sentences.NOT_SETTLED,)),
                 *about,
+                *((sentences.STILL_TRYING,) if tries and found.unlike_noise else ()),
                 *((sentences.PREDICTS,) if progress == "better" else ()),
                 *((sentences.STILL_PREDICTING,) if progress == "under way" else ()),
             ),
@@ -222,7 +238,7 @@ class LeastSquares:
             unlike_noise=found.unlike_noise,
             effective=progress == "better",
             random_forces=by_dof(problem.simulator, found.force),
-            timesteps=max(1, state.timesteps),
+            timesteps=timesteps,
         )
 
     def whole_run(self, problem: CalibrationProblem, state: LeastSquaresState, *, refining_epochs: int) -> int:
@@ -357,7 +373,8 @@ class LeastSquares:
         if not state.estimates_starts:
             if float(np.sqrt(best.cost[0])) < EXACT:
                 return False
-            before, after = consecutive_residuals(_searched(problem, state), best.point[0], best.rows)
+            searched = problem.with_shorter_timestep if state.timesteps > 1 else problem
+            before, after = consecutive_residuals(searched, best.point[0], best.rows)
             return alternation(before, -after) > 0.0
         tried = [length for length in range(LONGER, len(state.unknown)) if state.unknown[length].epochs]
         noise = all(self._noise_alone(problem, state, length) for length in tried)
@@ -389,8 +406,3 @@ class LeastSquares:
             elif (longer := self._with_model_errors(problem, state)) is not None:
                 about = (*about, sentences.about_model_errors(self._unknown(problem, longer).horizon))
         return notes, about
-
-
-def _searched(problem: CalibrationProblem, state: LeastSquaresState) -> CalibrationProblem:
-    """The problem with the timestep of the searches."""
-    return problem.with_shorter_timestep if state.trying or state.timesteps > 1 else problem

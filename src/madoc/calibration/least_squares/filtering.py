@@ -39,8 +39,6 @@ EARLY_EPOCHS = 8
 """Largest number of the first epochs, which end once the noise is known and steps are below `NEAR`."""
 WIDTH = 0.1
 """Width of a difference in [-1, 1] to either side at first; later it is by what is known of parameters, `axes_of`."""
-LONGEST = 0.5
-"""Largest change of a parameter in an epoch, in [-1, 1]."""
 DAMPED = 10.0
 """Factor of the damping where no step helps."""
 WORSE = 2.0
@@ -198,7 +196,7 @@ def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[F
     noise = next_noise(state.noise, 1.0 + (found.noise_ratio() - 1.0) / max(1, together), rounding)
     moved, pull = instruments.moved_by(undamped, error), bread @ undamped
     quiet = bool((((noise / state.noise) ** 2 - 1.0) ** 2).mean() < NOISE_SETTLED**2)
-    refused = not np.array_equal(taken, np.clip(undamped, -LONGEST, LONGEST))
+    refused = not np.array_equal(taken, np.clip(undamped, -instruments.LONGEST, instruments.LONGEST))
     following = replace(
         state,
         point=state.point + taken,
@@ -245,7 +243,9 @@ def _taken(
     There is none, and the next is damped more, where none helps.
     """
     damping = state.damping * np.array(TRIALS) * [not state.near, True, True]
-    tried = np.clip([damped_step(factor, target, state.point, each) for each in damping], -LONGEST, LONGEST)
+    tried = np.clip(
+        [damped_step(factor, target, state.point, each) for each in damping], -instruments.LONGEST, instruments.LONGEST
+    )
     points = np.concatenate([state.point[None], state.point + tried])
     given = problem.simulator, readings, points, side.few, state.noise
     surprise = innovations(*given, like=side.found, forces=side.forces).surprise(loss)

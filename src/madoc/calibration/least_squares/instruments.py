@@ -48,6 +48,8 @@ linear, and there is less of the ensembles' chance in wider ones."""
 OFF_LINE = 3.0
 """Standard deviations of noise that a prediction counts with for each that it is off a line: the minimum is farther
 away than the ends of the differences are."""
+LONGEST = 0.5
+"""Largest change of a parameter in an epoch, in [-1, 1]."""
 LARGEST_SHARE = 0.1
 """Largest share in [0, 1] of the squares of all windows, mean over all directions, that a window counts with."""
 ROUNDS = 10  # of weighting windows of too large a share less
@@ -255,11 +257,11 @@ class FilterState:
         together: Number of epochs near the end that the last step was by, 0 before these.
         failures: Number of windows whose simulation failed.
         force: Size of random forces in N/√kg (`random_forces`), 0 until these are looked for.
-        shorter_steps: By how much the parameters move without the timestep's error; 0 where that was not asked, or
-            leaves what is unlike noise too.
+        shorter_steps: By how much the parameters move without the timestep's error; 0 where the log is not likelier so,
+            or that leaves what is unlike noise too.
         asked: What is asked once the search has settled, and `nothing` before: whether a search from fitted starts
-            leads to `exact` values, whether a `shorter` timestep leaves noise, by a `trial` whether random forces act,
-            of what `size` they are, and nothing more when that is `known`.
+            leads to `exact` values, whether the log is likelier with a `shorter` timestep, by a `trial` whether random
+            forces act, of what `size` they are, and nothing more when that is `known`.
         explained_share: Share in [0, 1] of prediction errors, or of random forces, that state and action explain
             (`Innovations.explained_by`); 0 until the end.
     """
@@ -329,7 +331,7 @@ class FilterState:
 
     @property
     def settled(self) -> bool:
-        """Whether the search is at its end, the error of finite ensembles is known, and nothing is asked of forces."""
+        """Whether the search is at its end, the error of finite ensembles is known, and nothing is asked."""
         return self.at_rest and self.to_compare <= 0 and self.asked in ("nothing", "known")
 
     @property

@@ -15,6 +15,7 @@ from madoc.identification.ensembles import FilteredWindows, with_noise
 from madoc.identification.innovations import Innovations
 from madoc.identification.losses import Loss
 from madoc.identification.random_forces import largest
+from madoc.simulation.base import counted_as
 
 LARGE, LARGE_ROUNDS, LARGER = 64, 2, 4
 """Number of states that tell at the end whether what is left is noise, as few leave errors that are alike, and how
@@ -25,17 +26,18 @@ noise is estimated for a size."""
 SIZES, SMALLEST_SIZE = 8, -3.0
 """Number of sizes that are tried then, and power of ten of the smallest, in the largest."""
 BETTER = 2.0
-"""Standard errors of the windows' mean by which random forces make readings likelier, as chance does not."""
+"""Standard errors of the windows' mean by which another model makes readings likelier, as chance does not."""
 WHOLE = FINER / (FINER - 1)
-"""What a timestep's error changes over what one shorter by `FINER` does, as the error is in proportion to the step."""
-SHORTER_STEPS = 2
-"""Number of steps of the parameters with the shorter timestep: they begin where the model's own has led."""
+"""What the whole error of a timestep changes, over what a timestep `FINER` times as short does: the error is in
+proportion to the timestep."""
+STEPS = 2
+"""Number of steps of the parameters with either timestep, by which these are compared."""
 
 
 def members_for(state: FilterState) -> int:
-    """Number of states that the question asked takes of each window, each step of a shorter timestep being one."""
+    """Number of states that the question asked takes of each window; with a shorter timestep one counts as `FINER`."""
     step = MEMBERS + 2 * 2 * len(state.point) * instruments.FEW
-    shorter = MEMBERS + step + FINER * (MEMBERS + SHORTER_STEPS * step + (LARGE if state.unlike_noise else 0))
+    shorter = (1 + FINER) * (MEMBERS + STEPS * step) + FINER * LARGE * int(state.unlike_noise)
     return {"shorter": shorter, "trial": 2 * SIZE_ROUNDS * MEMBERS, "size": (1 + SIZES) * SIZE_ROUNDS * MEMBERS}.get(
         state.asked, 0
     )
@@ -82,25 +84,26 @@ def with_shorter_steps(
 ) -> FilterState:
     """The state with what a shorter timestep changes, where the log is likelier with it, and with what is asked next.
 
-    A machine has no timesteps: what those of the model do is like nothing that the machine could lack, and parameters
-    make up for it. Without its error they would have other values, by `shorter_steps` on the same windows. Errors that
-    are unlike noise and stay so have another cause.
+    A machine has no timesteps, and parameters make up for the error of the model's. Without it they would have other
+    values, by `shorter_steps` on the same windows. Errors that are unlike noise and stay so have another cause.
     """
     following = replace(state, asked="size" if state.unlike_noise else "trial", epochs=state.epochs + 1)
-    task = windows.simulator.task
-    if task.source is None:
+    task = windows.simulator.task.with_time_step(1.0 / FINER, substeps=FINER)
+    shorter = windows._replace(simulator=simulation.make(task))
+    own = _stepped(windows, state, rounding, loss)
+    with counted_as(FINER):
+        finer = _stepped(shorter, state, rounding, loss)
+        after = None if finer is None else _misfit(shorter, finer, rounding)
+    if own is None or finer is None or after is None:
         return following
-    shorter = windows._replace(simulator=simulation.make(task.with_time_step(1.0 / FINER, substeps=FINER)))
-    own, finer = _stepped(windows, state, rounding, loss), _stepped(shorter, state, rounding, loss, SHORTER_STEPS)
-    if own is None or finer is None:
-        return following
-    if not likelier(_misfit(shorter, finer, rounding), _misfit(windows, own, rounding), len(state.point)):
+    if not likelier(after, _misfit(windows, own, rounding), len(state.point)):
         return following
     following = replace(following, shorter_steps=WHOLE * (finer.point - own.point))
     if not state.unlike_noise:
         return following
     random = np.random.default_rng([state.seed, state.epochs, 3])
-    left = with_what_is_left(shorter, finer, rounding, loss, random, rounds=1)
+    with counted_as(FINER):
+        left = with_what_is_left(shorter, finer, rounding, loss, random, rounds=1)
     if left.unlike_noise:
         return replace(following, shorter_steps=np.zeros_like(state.point))
     return replace(following, asked="known", cost=left.cost, alike=left.alike, explained_share=left.explained_share)
@@ -119,10 +122,9 @@ def _stepped(
     state: FilterState,
     rounding: Float[np.ndarray, " channels"],
     loss: Loss,
-    steps: int = 1,
 ) -> FilterState | None:
     """The state after whole steps of the parameters and of the noise; None where too few simulations are whole."""
-    for step in range(steps):
+    for step in range(STEPS):
         random = [np.random.default_rng([state.seed, state.epochs, step, number]) for number in range(3)]
         found, noise = with_noise(windows, state.point, state.noise, rounding, MEMBERS, 1, random[2])
         sides = [Side.of(windows, found, state.point, state.spread, MEMBERS, each) for each in random[:2]]
@@ -131,6 +133,7 @@ def _stepped(
             return None
         gradients, products, squares = instruments.products_of(sides[0], sides[1], whole, loss)
         change = np.linalg.solve(instruments.agreed(products.sum(0), squares.sum(0)), gradients.sum(0))
+        change = np.clip(change, -instruments.LONGEST, instruments.LONGEST)
         state = replace(state, point=np.clip(state.point - change, -1.0, 1.0), noise=noise)
     return state
 
@@ -196,7 +199,7 @@ def _tried(
 
 
 def likelier(misfits: Float[np.ndarray, " windows"], without: Float[np.ndarray, " windows"], parameters: int) -> bool:
-    """Whether random forces certainly make windows' readings likelier; not where too few are whole to tell."""
+    """Whether windows' readings are certainly likelier than without a change; not where too few are whole to tell."""
     change = misfits - without
     change = change[np.isfinite(change)]
     enough = len(change) >= FEWEST + parameters

@@ -72,10 +72,11 @@ class LeastSquaresState:
         length: Index of the unknown search in progress.
         best: Index of the unknown search that has the estimate.
         finished: 1 once the next step would be too small to matter, else 0.
-        timesteps: Physics steps in one of the model's, once it is known with which the log is likelier; 0 before.
+        timesteps: Into how many steps each timestep of the model is divided, once it is known with how many the log is
+            likelier; 0 before.
         trying: 1 while a shorter timestep is on trial, else 0.
-        of_own: The state of the searches with the model's own timestep meanwhile, itself without one; before and after,
-            any of the same layout.
+        of_own: What the searches with the model's own timestep came to, while a shorter one is on trial. It is there
+            before and after as well, as the layout of a state must not change, and means nothing then.
     """
 
     known: SearchState | None

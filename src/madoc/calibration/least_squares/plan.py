@@ -82,11 +82,11 @@ class Found:
         point: The parameters, in [-1, 1].
         windows: Number of independent windows that tell it.
         settled: Whether the search has come to its end.
-        unlike_noise: Whether residuals have longer tails than noise has, are each like the next, or follow from state
-            and action.
+        unlike_noise: Whether residuals have longer tails than noise has, add up over longer windows, are each like the
+            next, or follow from state and action.
         force: Size of random forces in N/√kg (`identification.random_forces`); 0 where none were found.
-        shorter_steps: By how much the parameters move without the timestep's error, where that explains what is unlike
-            noise.
+        shorter_steps: By how much the parameters of a filter move without the timestep's error, where the log is
+            likelier so.
     """
 
     point: Float[np.ndarray, " d"]

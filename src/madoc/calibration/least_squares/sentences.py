@@ -31,6 +31,10 @@ NOT_RANDOM = (
     "forces act on the machine that the model does not have, and they are not random: state and action explain {:.0f} "
     "% of one of them; the model lacks something, and the intervals are too narrow, by how much is not known"
 )
+STILL_TRYING = (
+    "a search with a shorter timestep was under way when it ended: with a larger budget it tells whether the model's "
+    "timestep makes the residuals that are unlike noise"
+)
 TIMESTEP = (
     "the log is likelier with a timestep a quarter as long: the intervals also cover the estimate without the error of "
     "the model's timestep (give a shorter one in the spec to narrow them)"
@@ -155,11 +159,10 @@ def about_residuals(problem: CalibrationProblem, search: SearchState) -> tuple[s
 
 
 def about_model_errors(horizon: int) -> str:
-    """A sentence that longer windows leave more, which is for the verdict to judge: not every cause is the model's."""
+    """A sentence that longer windows leave more."""
     return (
         f"over {horizon} control steps residuals exceed the noise: the model lacks something that adds up (the verdict "
-        "says whether its tests found what), or starts of windows were not found; the intervals are those of the "
-        "shortest windows"
+        "says whether its tests found what); the intervals are those of the shortest windows"
     )
 
 
