@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 
 from adversary_cases.case import Action, Free, Robot
-from adversary_cases.robots import document, states
+from adversary_cases.robots import document, servos, states
 
 PUSHER_SERVO = (200.0, 20.0)
 """Stiffness (N/m) and damping (N·s/m) of the pusher's servo."""
@@ -11,15 +11,6 @@ WIPER_SERVO = (40.0, 4.0)
 """Stiffness (N·m/rad) and damping (N·m·s/rad) of the wiper's servos."""
 WALKER_SERVO = (80.0, 4.0)
 """Stiffness (N·m/rad) and damping (N·m·s/rad) of the walker's servos."""
-
-
-def servos(joints: tuple[str, ...], stiffness: float, damping: float) -> str:
-    """Position servos of the machine, which the spec adds to the user's model; none if they have no stiffness."""
-    if not stiffness:
-        return ""
-    return "\n".join(
-        f'    <position name="{joint}_target" joint="{joint}" kp="{stiffness}" kv="{damping}"/>' for joint in joints
-    )
 
 
 def pusher_mjcf(value: Mapping[str, float]) -> str:

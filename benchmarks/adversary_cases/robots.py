@@ -145,6 +145,15 @@ def hull_mjcf(value: Mapping[str, float]) -> str:
     return document("hull", 0.01, f"0 0 {value['gravity']}", world, motors)
 
 
+def servos(joints: tuple[str, ...], stiffness: float, damping: float) -> str:
+    """Position servos of the machine, which the spec adds to the user's model; none if they have no stiffness."""
+    if not stiffness:
+        return ""
+    return "\n".join(
+        f'    <position name="{joint}_target" joint="{joint}" kp="{stiffness}" kv="{damping}"/>' for joint in joints
+    )
+
+
 LEG_SERVO = (60.0, 1.0)
 """Stiffness (N·m/rad) and damping (N·m·s/rad) of the leg's servos."""
 
@@ -173,13 +182,9 @@ def leg_mjcf(value: Mapping[str, float]) -> str:
         </body>
       </body>
     </body>"""
-    servos = ""
-    if value["servo"]:
-        servos = "\n".join(
-            f'    <position name="{name}_target" joint="{name}" kp="{value["servo"]}" kv="{LEG_SERVO[1]}"/>'
-            for name in ("hip", "knee")
-        )
-    return document("leg", 0.002, f"0 0 {value['gravity']}", world, servos)
+    return document(
+        "leg", 0.002, f"0 0 {value['gravity']}", world, servos(("hip", "knee"), value["servo"], LEG_SERVO[1])
+    )
 
 
 def cart_mjcf(value: Mapping[str, float]) -> str:
