@@ -143,10 +143,7 @@ class LeastSquares:
         return None if state.known is None else times * self._known(problem).epoch_steps(problem, state.known)
 
     def _then_predicting(self, problem: CalibrationProblem, state: LeastSquaresState) -> LeastSquaresState:
-        """Once the searches have ended, try a shorter timestep; then fit for prediction if they left more than noise.
-
-        Predictions are those of the model's own timestep.
-        """
+        """Once the searches have ended, try a shorter timestep; then fit for prediction if more than noise is left."""
         adds_up = partial(self._adds_up, problem)
         state = timestep.followed(problem, state, self._unknown(problem).horizon, adds_up)
         prediction = state.prediction
@@ -177,27 +174,20 @@ class LeastSquares:
             # Model errors bias all lengths, and only the wide intervals of the shortest may cover that.
             spread = state.unknown[0]
             windows = spread.explained
+        adds_up = bool(self._adds_up(problem, state))
         return Found(
             point=best.point[0 if best.refining else int(np.argmin(best.cost))],
             uncertainty=sandwich(spread.bread, spread.meat),
             windows=windows,
             settled=settled,
-            unlike_noise=settled and state.estimates_starts and self._unlike_noise(problem, state),
+            unlike_noise=settled and state.estimates_starts and (adds_up or sentences.have_long_tails(problem, best)),
         )
-
-    def _unlike_noise(self, problem: CalibrationProblem, state: LeastSquaresState) -> bool:
-        """Whether residuals have longer tails than noise, or add up over longer windows."""
-        return bool(self._adds_up(problem, state)) or sentences.have_long_tails(problem, self._fitted(state))
 
     def _adds_up(self, problem: CalibrationProblem, state: LeastSquaresState) -> bool | None:
         """Whether longer windows leave more than noise; None where no search on longer ones has settled."""
-        if not state.searched or not state.estimates_starts:
-            return None
-        if self._with_model_errors(problem, state) is not None:
-            return True
-        longer = range(LONGER, len(state.unknown))
-        settled = [each for each in longer if self._unknown(problem).settled(state.unknown[each])]
-        return False if settled else None
+        longer = state.unknown[LONGER:] if state.searched and state.estimates_starts else ()
+        settled = any(map(self._unknown(problem).settled, longer))
+        return self._with_model_errors(problem, state) is not None if settled else None
 
     def estimate(self, problem: CalibrationProblem, state: LeastSquaresState) -> Estimate:
         """The best search's point, with its sandwich covariance and intervals of Student's t."""
