@@ -235,8 +235,7 @@ class LeastSquares:
         """About how many control steps a whole run takes, counting the stages that the data is known to need so far."""
         steps = 0
         if state.known is not None:
-            epochs = 0 if state.stage == "starting" else refining_epochs
-            steps += self._known(problem).whole_run(problem, state.known, epochs)
+            steps += self._known(problem).whole_run(problem, state.known, refining_epochs * (state.stage != "starting"))
         if state.filtered is not None and state.stage in ("starting", "filtering"):
             steps += filtering.whole_run(problem, state.filtered)
         elif state.stage != "undecided":
@@ -244,6 +243,9 @@ class LeastSquares:
                 if LONGER <= length < len(state.unknown) - 1 and not search.epochs:
                     continue
                 steps += self._unknown(problem, length).whole_run(problem, search, refining_epochs)
+                if not length and problem.simulator.task.source is not None:  # a shorter timestep, given up at once
+                    tried = replace(search, refining=1), lengthening.FIRST_STEPS
+                    steps += FINER * self._unknown(problem).whole_run(problem, *tried)
         return steps
 
     def _first_stage(self, problem: CalibrationProblem) -> Stage:

@@ -132,9 +132,9 @@ def epoch_steps(problem: CalibrationProblem, state: FilterState) -> int:
 
 
 def whole_run(problem: CalibrationProblem, state: FilterState) -> int:
-    """About how many control steps a whole search takes, with the trial at its end, if no random forces act."""
+    """About how many control steps a whole search takes, with the questions at its end, if no random forces act."""
     search = sum(USUAL_EPOCHS[wide] * epoch_steps(problem, replace(state, wide=wide)) for wide in (0, 1))
-    return search + epoch_steps(problem, replace(state, asked="trial"))
+    return search + sum(epoch_steps(problem, replace(state, asked=each)) for each in ("shorter", "trial"))
 
 
 def step(problem: CalibrationProblem, state: FilterState, loss: Loss) -> tuple[FilterState, Epoch]:
