@@ -128,7 +128,7 @@ def about_timestep(problem: CalibrationProblem) -> str:
     return (
         f"the log is likelier with a timestep of {own / FINER:.12g} s than with the model's of {own:.12g} s, so the "
         "parameters were estimated and tested with the shorter one, and do not make up for the error of the longer; "
-        "predictions are those of the model's own timestep"
+        "predictions over longer times are those of the model's own timestep"
     )
 
 
