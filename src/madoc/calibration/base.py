@@ -11,7 +11,6 @@ from madoc import simulation
 from madoc.data import Dataset, typical_change
 from madoc.data.disturbing import row_change
 from madoc.errors import MadocError
-from madoc.identification.candidate_effects import FINER
 from madoc.identification.information import NORMAL_95
 from madoc.identification.noise import difference_noise, rounding_of
 from madoc.identification.states import LoggedStates, probing_rows, states_of
@@ -52,9 +51,8 @@ class CalibrationProblem:
 
     @cached_property
     def with_shorter_timestep(self) -> "CalibrationProblem":
-        """The same problem with a timestep `FINER` times as short, and the same states of the log."""
-        task = self.simulator.task.with_time_step(1.0 / FINER, substeps=FINER)
-        shorter = CalibrationProblem(self.dataset, simulation.make(task))
+        """The same problem with a timestep `simulation.FINER` times as short, and the same states of the log."""
+        shorter = CalibrationProblem(self.dataset, simulation.with_shorter_timestep(self.simulator))
         vars(shorter).update(states=self.states, typical_change=self.typical_change)
         return shorter
 

@@ -7,10 +7,10 @@ from madoc import simulation
 from madoc.data import Dataset, stride, typical_change
 from madoc.data.findings import Finding
 from madoc.errors import listed
-from madoc.identification.candidate_effects import FINER
 from madoc.identification.replay import window_residuals
 from madoc.identification.states import LoggedStates, probing_rows, probing_windows
 from madoc.identification.windows import evenly
+from madoc.simulation import FINER
 from madoc.simulation.base import Simulator
 from madoc.simulation.response import hidden_scales, mass_like
 
@@ -130,7 +130,7 @@ def coarseness(
     is left. The parameters `point` are in [-1, 1].
     """
     windows = probing_windows(logged, dataset, simulator, steps=stride(dataset), count=_WINDOWS)
-    finer = simulation.make(simulator.task.with_time_step(1.0 / FINER, substeps=FINER))
+    finer = simulation.with_shorter_timestep(simulator)
     coarse, fine = (
         window_residuals(each, windows, point[None], scale)[0].reshape(len(windows), windows.steps, -1)[:, -1]
         for each in (simulator, finer)

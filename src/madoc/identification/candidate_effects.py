@@ -28,8 +28,6 @@ _SATURATED = 0.3
 """Share of the largest logged action by which actions are cut off, to compute the effect of a drive that saturates."""
 _LATER = 0.1
 """Delay in control steps with which the effect of a delay is computed."""
-FINER = 4
-"""Number of integration steps that take the place of one."""
 
 
 def effects(
@@ -58,7 +56,7 @@ def effects(
     late = replace(readings, actions=readings.actions + _LATER * (earlier - readings.actions))
     saturated = replace(readings, actions=_cut_off(readings.actions, simulator))
     stretched = simulation.make(simulator.task.with_time_step(1.0 + CHANGE))
-    finer = simulation.make(simulator.task.with_time_step(1.0 / FINER, substeps=FINER))
+    finer = simulation.with_shorter_timestep(simulator)
     fields = {each.field for each in simulator.parameters.parameters}
     timed = [each for each in simulator.parameters.parameters if each.kind.of_all]
     tilts = TILTS if np.any(simulator.task.model.opt.gravity) else ()

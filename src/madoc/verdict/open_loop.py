@@ -17,12 +17,12 @@ from madoc import simulation
 from madoc.calibration.holdout import OpenLoop
 from madoc.data import stride
 from madoc.identification import random_forces
-from madoc.identification.candidate_effects import FINER
 from madoc.identification.noise import residual_noise
 from madoc.identification.replay import window_residuals
 from madoc.identification.states import logged_states
 from madoc.identification.windows import evenly, rows_that_fit, windows_at
 from madoc.parameters import Parameter, ParameterSpace
+from madoc.simulation import FINER
 from madoc.simulation.attitudes import moved
 from madoc.simulation.base import Simulator
 from madoc.simulation.write import nominal_values
@@ -263,10 +263,8 @@ def _imitated(
 
 def _finer(bench: Bench) -> Simulator:
     """The calibrated model with a timestep of a quarter of the length, where a spec makes it."""
-    task = bench.simulator.task
-    if task.source is None:
-        return bench.simulator
-    return simulation.make(task.with_time_step(1.0 / FINER, substeps=FINER))
+    own = bench.simulator
+    return own if own.task.source is None else simulation.with_shorter_timestep(own)
 
 
 def _where_finite(values: np.ndarray) -> np.ndarray:

@@ -16,11 +16,11 @@ from madoc.calibration.least_squares.search import Search, SearchState
 from madoc.calibration.least_squares.unknown_starts import UnknownStarts
 from madoc.data import stride
 from madoc.errors import MadocError
-from madoc.identification.candidate_effects import FINER
 from madoc.identification.information import identifiability, quantile, sandwich
 from madoc.identification.losses import Loss
 from madoc.identification.noise import NOISY, alternation
 from madoc.identification.random_forces import by_dof
+from madoc.simulation import FINER
 from madoc.simulation.base import SIMULATED, counted_as
 from madoc.types import Count, Epoch, NotNegative, check_hyperparameters, named_key
 

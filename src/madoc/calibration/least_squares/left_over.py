@@ -10,11 +10,11 @@ from madoc import simulation
 from madoc.calibration.least_squares import instruments
 from madoc.calibration.least_squares.instruments import MEMBERS, NEAR, FilterState, Side
 from madoc.calibration.least_squares.plan import FEWEST, LONG_TAILS
-from madoc.identification.candidate_effects import FINER
 from madoc.identification.ensembles import FilteredWindows, with_noise
 from madoc.identification.innovations import Innovations
 from madoc.identification.losses import Loss
 from madoc.identification.random_forces import largest
+from madoc.simulation import FINER
 from madoc.simulation.base import counted_as
 
 LARGE, LARGE_ROUNDS, LARGER = 64, 2, 4
@@ -88,8 +88,7 @@ def with_shorter_steps(
     values, by `shorter_steps` on the same windows. Errors that are unlike noise and stay so have another cause.
     """
     following = replace(state, asked="size" if state.unlike_noise else "trial", epochs=state.epochs + 1)
-    task = windows.simulator.task.with_time_step(1.0 / FINER, substeps=FINER)
-    shorter = windows._replace(simulator=simulation.make(task))
+    shorter = windows._replace(simulator=simulation.with_shorter_timestep(windows.simulator))
     own = _stepped(windows, state, rounding, loss)
     with counted_as(FINER):
         finer = _stepped(shorter, state, rounding, loss)

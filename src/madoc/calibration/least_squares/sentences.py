@@ -9,10 +9,10 @@ from madoc.calibration.least_squares.plan import EXACT, LONG_TAILS
 from madoc.calibration.least_squares.search import SearchState
 from madoc.data import stride
 from madoc.data.velocities import dof_names
-from madoc.identification.candidate_effects import FINER
 from madoc.identification.noise import WHITE
 from madoc.identification.random_forces import by_dof
 from madoc.identification.systematic import EXPLAINED
+from madoc.simulation import FINER
 
 MOST_LEFT_OUT = 0.05
 """Share in [0, 1] of windows that no initial state explains; without contacts, noise alone leaves out fewer."""

@@ -17,8 +17,8 @@ from madoc.calibration.base import CalibrationProblem
 from madoc.calibration.least_squares.lengthening import FIRST_STEPS, LEFT_OUT, LeastSquaresState, continued
 from madoc.calibration.least_squares.plan import EXACT
 from madoc.calibration.least_squares.search import SearchState
-from madoc.identification.candidate_effects import FINER
 from madoc.identification.gauss_newton import FIRST_DAMPING
+from madoc.simulation import FINER
 
 CERTAINLY = 10.0
 """Logarithm of how many times as likely a shorter timestep makes the log at least: a quarter of one is no other model,
