@@ -120,6 +120,13 @@ def test_a_log_of_a_finer_simulation_is_judged_with_its_timestep_or_beside_the_e
         np.testing.assert_allclose(estimate.mean, truth, rtol=1e-6)
     else:
         assert errors[0].value == pytest.approx(1.0, abs=0.01) and errors[0].explained > 0.99
+        shorter = madoc.assess(replace(estimate, test_timesteps=4), parts.held)  # as a filter's, of its own timestep
+        assert shorter.holdout.noise == found.holdout.noise and shorter.holdout.open_loop == found.holdout.open_loop
+        terms = {term.cause: term for term in shorter.holdout.missing_terms}
+        assert INTEGRATION not in terms and not any(term.explained > 0.01 for term in terms.values())
+        late = Bench(problem, parts.held, jax.random.key(0), until=time.monotonic() + 60.0, rate=1e9, divided=4)
+        assert late.for_tests.problem is problem.with_shorter_timestep
+        assert replace(late, rate=1.0).for_tests.problem is problem  # with no time for it
     low, high = np.asarray(found.result.interval).T
     assert (np.maximum(low - truth, truth - high) < 1e-4 * (space.high - space.low)).all()
 

@@ -139,6 +139,8 @@ class Estimate:
             method does not estimate the noise.
         random_forces: By degree of freedom of the model, in its order; empty where none were found that are random.
         timesteps: Into how many steps each timestep of the model was divided for the estimate.
+        test_timesteps: The same for tests of what the model lacks: more where the log is likelier with a shorter
+            timestep.
         group_stability: Mean adjusted Rand index of the groups with those found from resampled states, or proposed in
             other epochs; 1 is the same groups, 0 chance. None where groups were not found from the problem.
         embeddings: One vector for each parameter, close together for those that act alike; None where none was learnt.
@@ -158,6 +160,7 @@ class Estimate:
     effective: bool = False
     random_forces: Float[np.ndarray, " dof"] = field(default_factory=lambda: np.zeros(0))
     timesteps: int = 1
+    test_timesteps: int = 1
     group_stability: float | None = None
     embeddings: Float[np.ndarray, "d latent"] | None = None
 

@@ -101,6 +101,7 @@ def calibrate(
         effective=estimate.effective,
         random_forces=dict(zip(dof_names(problem.simulator.task), forces, strict=True)) if forces else {},
         timesteps=estimate.timesteps,
+        test_timesteps=estimate.test_timesteps,
         group_stability=estimate.group_stability,
         problem=problem,
     )

@@ -76,8 +76,9 @@ class CalibrationResult:
         effective: Whether the model leaves more than noise, and the estimate is the one that predicts best with it.
         random_forces: Standard deviation of random forces by degree of freedom, in N or N·m, new ones in each control
             step, that act on the machine besides what the model has; empty where none were found that are random.
-        timesteps: Into how many steps each timestep of the model was divided for the estimate and the tests of what the
-            model lacks: more than one where the log is likelier with a shorter timestep.
+        timesteps: Into how many steps each timestep of the model was divided for the estimate.
+        test_timesteps: The same for tests of what the model lacks, where there is time: more than one where the log is
+            likelier with a shorter timestep.
         group_stability: How alike groups of resampled states are: their mean adjusted Rand index, 1 for the same
             groups, 0 for chance; None where the method did not find groups.
         chosen: Why `auto` took this method, in a sentence; None where the method was named.
@@ -107,6 +108,7 @@ class CalibrationResult:
     effective: bool = False
     random_forces: dict[str, float] = field(default_factory=dict)
     timesteps: int = 1
+    test_timesteps: int = 1
     judging_seconds: float = field(default=0.0, compare=False)
     group_stability: float | None = None
     chosen: str | None = None

@@ -77,7 +77,8 @@ def assess(
             f"expected a simulator with the result's parameters {', '.join(result.parameters)}, got one with "
             f"{', '.join(bench.simulator.parameters.names)}"
         )
-    tested = bench.with_timestep_of(result.timesteps)  # predictions over longer times are the model's as it is
+    # Predictions over longer times are the model's as it is.
+    tested = bench.with_timestep_of(result.timesteps, result.test_timesteps)
     bench.left_out.clear()
     began, simulated = time.monotonic(), SIMULATED.control_steps
     point = np.clip(bench.simulator.parameters.to_unit(result.mean), -1.0, 1.0)

@@ -60,6 +60,7 @@ class Bench:
         rate: Control steps that are simulated in a second, which matters under such a limit.
         tell: What is told of each part of the work.
         left_out: What there was no time for so far.
+        divided: Into how many steps each timestep is divided for tests of what the model lacks, where there is time.
 
     Raises:
         MadocError: Too few rows are held out, or they are not of the simulator's robot.
@@ -73,6 +74,7 @@ class Bench:
     rate: float = 1.0
     tell: Callable[[str], None] = lambda part: None
     left_out: list[str] = field(default_factory=list)
+    divided: int = 1
 
     def __post_init__(self) -> None:
         if len(self.held_out) < FEWEST_HELD:
@@ -130,14 +132,21 @@ class Bench:
         """The robot, with the ranges of its parameters."""
         return self.problem.simulator
 
-    def with_timestep_of(self, timesteps: int) -> "Bench":
-        """The bench on which an estimate is judged that was made with so many steps in each of the model's timesteps.
+    def with_timestep_of(self, timesteps: int, tests: int = 1) -> "Bench":
+        """The bench for an estimate that was made with so many steps in each of the model's timesteps.
 
-        What there is no time for is noted in one place for both.
+        `tests` are those of tests of what the model lacks. What there is no time for is noted in one place for both.
         """
         if timesteps == 1:
-            return self
-        return replace(self, problem=self.problem.with_shorter_timestep, rate=self.rate / timesteps)
+            return self if tests == 1 else replace(self, divided=tests)
+        return replace(self, problem=self.problem.with_shorter_timestep, rate=self.rate / timesteps, divided=1)
+
+    @property
+    def for_tests(self) -> "Bench":
+        """The bench on which it is tested what the model lacks: with `divided` timesteps, if there is time for that."""
+        shorter = self.with_timestep_of(self.divided)
+        in_time = shorter.seconds_left >= shorter.windows_to_test * shorter.window_seconds
+        return shorter if in_time else self
 
     @property
     def scaling(self) -> Scaling:

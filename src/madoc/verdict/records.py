@@ -120,7 +120,8 @@ def judged(
     coarse, exchanged = 0.0, _exchanged(bench, point, at)  # tests take what is left of the time
     if bench.simulator.task.source is not None and bench.begins("the length of the timestep"):
         coarse = coarseness(problem.dataset, bench.states, problem.simulator, point, bench.change)
-    doubts = _doubts(bench, point, own)
+    testing = bench.for_tests
+    doubts = _doubts(testing, point, own)
     # Actions that seem late are none where tests at the estimate exclude it.
     in_time = actions_in_time(doubts.terms, bench.simulator.control_step)
     against = (each for each in (*exchanged, *problem.dataset.findings) if each.contradicts)
@@ -158,13 +159,13 @@ def judged(
     )
     shorter = SHORTER if far_beyond_noise(found) and missing_term(found) is None else 1
     if shorter > 1:
-        doubts = _doubts(bench, point, own, shorter)
+        doubts = _doubts(testing, point, own, shorter)
         found = _told_apart(found, doubts)
     unexplained = far_beyond_noise(found) and missing_term(found) is None
     contradicting = tuple(each for each in contradicting if unexplained or not each.rough)
     late = next((each for each in contradicting if each.late), None)
     term = missing_term(found) if late is None else _delay(doubts, late)
-    tested = partial(_richer, bench, point, own, doubts=doubts, shorter=shorter)
+    tested = partial(_richer, testing, point, own, doubts=doubts, shorter=shorter)
     richer = tested(term)
     with_lag = None
     if term is not None and richer is not None and richer.left and term.parameter.startswith(_DELAYED):

@@ -229,6 +229,7 @@ class LeastSquares:
             effective=progress == "better",
             random_forces=by_dof(problem.simulator, found.force),
             timesteps=timesteps,
+            test_timesteps=FINER if moved.any() else timesteps,
         )
 
     def whole_run(self, problem: CalibrationProblem, state: LeastSquaresState, *, refining_epochs: int) -> int:
@@ -388,10 +389,8 @@ class LeastSquares:
         if not state.estimates_starts or self.initial_states is not None:
             return (), ()
         best, horizon = state.unknown[state.best], self._unknown(problem, state.best).horizon
-        notes, about = (
-            (sentences.about_estimated_states(problem, best, horizon),),
-            sentences.about_residuals(problem, best),
-        )
+        notes = (sentences.about_estimated_states(problem, best, horizon),)
+        about = sentences.about_residuals(problem, best)
         if float(best.deviation.max()) >= EXACT:
             if state.stage == "lengthening" and not state.searched:
                 about = (*about, sentences.STILL_LENGTHENING)

@@ -1,6 +1,7 @@
 """What the filter's search leaves at its end: noise, the error of a timestep that is too long, or what forces make."""
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -31,13 +32,13 @@ WHOLE = FINER / (FINER - 1)
 """What the whole error of a timestep changes, over what a timestep `FINER` times as short does: the error is in
 proportion to the timestep."""
 STEPS = 2
-"""Number of steps of the parameters with either timestep, by which these are compared."""
+"""Number of steps of the parameters with the shorter timestep, after which it is compared with the model's own."""
 
 
 def members_for(state: FilterState) -> int:
     """Number of states that the question asked takes of each window; with a shorter timestep one counts as `FINER`."""
     step = MEMBERS + 2 * 2 * len(state.point) * instruments.FEW
-    shorter = (1 + FINER) * (MEMBERS + STEPS * step) + FINER * LARGE * int(state.unlike_noise)
+    shorter = MEMBERS + step + FINER * (MEMBERS + STEPS * step + LARGE * int(state.unlike_noise))
     return {"shorter": shorter, "trial": 2 * SIZE_ROUNDS * MEMBERS, "size": (1 + SIZES) * SIZE_ROUNDS * MEMBERS}.get(
         state.asked, 0
     )
@@ -85,19 +86,28 @@ def with_shorter_steps(
     """The state with what a shorter timestep changes, where the log is likelier with it, and with what is asked next.
 
     A machine has no timesteps, and parameters make up for the error of the model's. Without it they would have other
-    values, by `shorter_steps` on the same windows. Errors that are unlike noise and stay so have another cause.
+    values, by `shorter_steps`: so far they must move until the same windows pull them no more than they do at the
+    search's end, by what all windows tell of them. Errors that are unlike noise and stay so have another cause.
     """
     following = replace(state, asked="size" if state.unlike_noise else "trial", epochs=state.epochs + 1)
     shorter = windows._replace(simulator=simulation.with_shorter_timestep(windows.simulator))
-    own = _stepped(windows, state, rounding, loss)
+    own, finer = _pull(windows, state, rounding, loss), state
+    if own is None:
+        return following
+    seen = state.squares.any((1, 2)).sum()
+    bread = instruments.agreed(state.products.sum(0), state.squares.sum(0)) / seen
     with counted_as(FINER):
-        finer = _stepped(shorter, state, rounding, loss)
-        after = None if finer is None else _misfit(shorter, finer, rounding)
-    if own is None or finer is None or after is None:
+        for _ in range(STEPS):
+            pull = _pull(shorter, finer, rounding, loss)
+            if pull is None:
+                return following
+            change = np.linalg.solve(bread, own.gradient - pull.gradient)
+            change = np.clip(change, -instruments.LONGEST, instruments.LONGEST)
+            finer = replace(finer, point=np.clip(finer.point + change, -1.0, 1.0), noise=pull.noise)
+        after = _misfit(shorter, finer, rounding)
+    if not likelier(after, _misfit(windows, replace(state, noise=own.noise), rounding), len(state.point)):
         return following
-    if not likelier(after, _misfit(windows, own, rounding), len(state.point)):
-        return following
-    following = replace(following, shorter_steps=WHOLE * (finer.point - own.point))
+    following = replace(following, shorter_steps=WHOLE * (finer.point - state.point))
     if not state.unlike_noise:
         return following
     random = np.random.default_rng([state.seed, state.epochs, 3])
@@ -116,25 +126,25 @@ def _misfit(
     return with_noise(windows, state.point, state.noise, rounding, MEMBERS, 1, random)[0].misfit()
 
 
-def _stepped(
-    windows: FilteredWindows,
-    state: FilterState,
-    rounding: Float[np.ndarray, " channels"],
-    loss: Loss,
-) -> FilterState | None:
-    """The state after whole steps of the parameters and of the noise; None where too few simulations are whole."""
-    for step in range(STEPS):
-        random = [np.random.default_rng([state.seed, state.epochs, step, number]) for number in range(3)]
-        found, noise = with_noise(windows, state.point, state.noise, rounding, MEMBERS, 1, random[2])
-        sides = [Side.of(windows, found, state.point, state.spread, MEMBERS, each) for each in random[:2]]
-        whole = found.whole[0] & sides[0].ends.whole.all(0) & sides[1].ends.whole.all(0)
-        if whole.sum() < FEWEST + len(state.point):
-            return None
-        gradients, products, squares = instruments.products_of(sides[0], sides[1], whole, loss)
-        change = np.linalg.solve(instruments.agreed(products.sum(0), squares.sum(0)), gradients.sum(0))
-        change = np.clip(change, -instruments.LONGEST, instruments.LONGEST)
-        state = replace(state, point=np.clip(state.point - change, -1.0, 1.0), noise=noise)
-    return state
+class _Pull(NamedTuple):
+    """The mean gradient of windows' cost at a point, and the noise that is found there."""
+
+    gradient: Float[np.ndarray, " d"]
+    noise: Float[np.ndarray, " channels"]
+
+
+def _pull(
+    windows: FilteredWindows, state: FilterState, rounding: Float[np.ndarray, " channels"], loss: Loss
+) -> _Pull | None:
+    """What pulls the parameters, by the same random numbers for all; None where too few simulations are whole."""
+    random = [np.random.default_rng([state.seed, state.epochs, number]) for number in range(3)]
+    found, noise = with_noise(windows, state.point, state.noise, rounding, MEMBERS, 1, random[2])
+    sides = [Side.of(windows, found, state.point, state.spread, MEMBERS, each) for each in random[:2]]
+    whole = found.whole[0] & sides[0].ends.whole.all(0) & sides[1].ends.whole.all(0)
+    if whole.sum() < FEWEST + len(state.point):
+        return None
+    gradients, _, _ = instruments.products_of(sides[0], sides[1], whole, loss)
+    return _Pull(gradients.sum(0) / whole.sum(), noise)
 
 
 def with_trial(windows: FilteredWindows, state: FilterState, rounding: Float[np.ndarray, " channels"]) -> FilterState:
