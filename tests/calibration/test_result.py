@@ -7,7 +7,6 @@ from test_holdout import REPORTS
 
 from madoc.calibration import CalibrationResult, ParameterEstimate
 from madoc.errors import MadocError
-from madoc.identification.concentration import Concentration
 
 
 def result(**changes):
@@ -58,9 +57,8 @@ def test_intervals_have_a_column_of_their_own():
 
 @pytest.mark.parametrize("report", REPORTS)
 def test_the_record_of_the_hold_out_comes_back_as_it_was(report):
-    for told in (report, replace(report, concentration=Concentration(0.0, "", "speed"))):
-        stored = json.loads(json.dumps(result(holdout=told).to_json()))
-        assert CalibrationResult.from_json(stored).holdout == told
+    stored = json.loads(json.dumps(result(holdout=report).to_json()))
+    assert CalibrationResult.from_json(stored).holdout == report
 
 
 def test_why_auto_took_a_method_is_kept_and_told():

@@ -9,7 +9,7 @@ import pytest
 from madoc import simulation
 from madoc.data import typical_change
 from madoc.identification import fitted_windows
-from madoc.identification.fitted_windows import fit_windows, windows_of
+from madoc.identification.fitted_windows import Fit, alike, fit_windows, windows_of
 from madoc.identification.linearisation import WindowSlopes
 from madoc.identification.replay import Readings
 from madoc.identification.states import states_of
@@ -94,3 +94,22 @@ def test_shorter_windows_are_as_many_times_more():
     usual, shorter = windows_of(*given, fewest=30), windows_of(*given, fewest=30, shorter=4)
     assert shorter.readings.steps == usual.readings.steps // 4
     assert len(shorter.readings) == 4 * len(usual.readings)
+
+
+def test_what_is_left_is_alike_in_a_row_where_it_is_not_noise():
+    """By hand, in 100 windows of 5 readings of 3 signals: 4 products of neighbours to 5 squares."""
+    readings, same = (
+        Readings(np.zeros((100, 4, 1)), np.zeros((100, 5, 3)), np.ones(3), np.ones(2)),
+        np.ones((100, 5, 3)),
+    )
+
+    def of(errors):
+        slopes = WindowSlopes(errors.reshape(100, 15), *(np.zeros((100, 15, 0)),) * 2, np.ones(100, bool))
+        return alike(Fit(np.zeros(0), np.zeros((100, 0)), slopes, np.zeros((100, 15, 0)), slopes.whole), readings)
+
+    assert of(same) == pytest.approx(0.8)
+    assert of(same * np.array([1.0, -1.0, 1.0, -1.0, 1.0])[:, None]) == pytest.approx(-0.8)
+    assert of(1e-4 * same) == pytest.approx(0.008)  # rounding errors of a simulation are no sensor's
+    small = same * np.array([1.0, 0.0, 0.0])  # a signal whose errors last, beside the noise of another
+    loud = np.random.default_rng(0).standard_normal((100, 5, 3)) * np.array([0.0, 10.0, 0.0])
+    assert abs(of(small + loud)) < 0.1

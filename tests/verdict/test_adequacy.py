@@ -20,7 +20,6 @@ from madoc.verdict.adequacy import (
     about_imitated,
     actions_in_time,
     as_likely,
-    coarse_step,
     in_full,
     likeliest,
     missing_term,
@@ -118,10 +117,9 @@ def test_other_estimates_by_a_coarse_step_are_taken_in_full():
     assert in_full((by_step,), [replace(step, explained=0.1)]) == (by_step,)
 
 
-def test_the_term_that_explains_most_is_named_among_those_as_significant():
-    friction, spring = term(explained=0.2), term("a spring", t=9.0, explained=0.05, parameter="jnt_stiffness.hip")
+def test_the_term_that_explains_most_is_named():
+    friction, spring = term(explained=0.2), term("a spring", t=30.0, explained=0.05, parameter="jnt_stiffness.hip")
     assert missing_term(held(spring, friction)) is friction
-    assert missing_term(held(term("a spring", t=30.0, explained=0.05), friction)).cause == "a spring"
 
 
 def test_small_terms_are_covered_by_intervals_and_not_named():
@@ -154,12 +152,12 @@ def test_what_is_usual_is_named_before_a_tilted_base():
     assert likeliest([]) is None
 
 
-def test_forces_that_are_not_listed_are_named_where_nothing_listed_explains_half_as_much():
+def test_forces_that_are_not_listed_are_named_where_nothing_listed_explains_nearly_as_much():
     family = term(f"{UNLISTED} (hip), which grows most with its speed", t=12.0, explained=0.5, parameter="")
-    drag = term(f"{WEAKENING} (hip)", t=7.5, explained=0.26, parameter="")
+    drag = term(f"{WEAKENING} (hip)", t=7.5, explained=0.41, parameter="")
     assert missing_term(held(family, drag)) is drag
     assert as_likely(held(family, drag).missing_terms, drag) == []
-    weaker, elsewhere = replace(drag, explained=0.24), replace(family, cause=f"{UNLISTED} (knee)", explained=0.45)
+    weaker, elsewhere = replace(drag, explained=0.39), replace(family, cause=f"{UNLISTED} (knee)", explained=0.45)
     assert missing_term(held(family, weaker)) is family
     assert as_likely(held(family, elsewhere, weaker).missing_terms, family) == [elsewhere]
     sentence = judge(held(family, elsewhere)).sentence
@@ -176,13 +174,7 @@ def test_drives_that_all_weaken_have_words_in_a_spec():
 
 def test_what_is_uncertain_is_not_missing():
     assert missing_term(held(term(t=4.9))) is None
-    assert missing_term(held(term(DRIFT, t=5.5))) is None
-
-
-def test_what_moves_the_estimate_is_named_first_and_else_what_does_not():
-    offset, friction = term("an offset", shift=0.1, explained=0.8), term(explained=0.2)
-    assert missing_term(held(offset, friction)) is friction
-    assert missing_term(held(offset, replace(friction, t=4.0))) is offset
+    assert missing_term(held(term(DRIFT, t=4.9))) is None
 
 
 def test_an_error_of_the_timestep_that_explains_much_has_a_possible_value():
@@ -201,18 +193,6 @@ def test_terms_that_explain_nearly_as_much_are_as_likely():
     friction, gain = term(explained=0.5), term("another gain", explained=0.45)
     assert as_likely(held(friction, gain, term("a spring", explained=0.3)).missing_terms, friction) == [gain]
     assert as_likely(held(friction, term("another gain", t=4.0, explained=0.5)).missing_terms, friction) == []
-
-
-def test_a_coarse_integration_step_that_explains_more_is_told_first():
-    step, friction = term(INTEGRATION, t=6.0, explained=0.1, parameter=""), term(explained=0.05)
-    assert coarse_step(held(step, friction), friction) is step
-    assert (
-        "; first take a smaller timestep of the model, whose error explains 10 % (t = 6)"
-        in judge(held(step, friction)).sentence
-    )
-    assert coarse_step(held(step, friction), term(explained=0.2)) is None
-    assert coarse_step(held(replace(step, t=4.0), friction), friction) is None
-    assert coarse_step(held(replace(step, value=3.5), friction), friction) is None
 
 
 def test_a_force_of_two_shapes_is_no_rival_of_itself():

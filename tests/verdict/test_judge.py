@@ -363,22 +363,3 @@ def test_an_estimate_beats_mid_range_beyond_chance():
     assert all(beats_mid_range(good) for good in (PREDICTED, FITTED, TOLD_APART))
     assert not beats_mid_range(changed(FITTED, {"relative": 0.9, "relative_interval": (0.7, 1.1)}))
     assert not beats_mid_range(replace(TOLD_APART, area_at_estimate=Area(0.88, (0.85, 0.91), 400)))
-
-
-@pytest.mark.parametrize(
-    ("holdout", "unlike_noise"),
-    [
-        (lacking(PREDICTED), False),
-        (replace(PREDICTED, at_end=("mass",)), False),
-        (replace(PREDICTED, contradictions=("torque comes late",)), False),
-        (PREDICTED, True),
-    ],
-    ids=["systematic", "at an end", "contradicted", "long tails"],
-)
-def test_a_mismatch_of_a_model_with_too_long_a_timestep_says_so(holdout, unlike_noise):
-    for coarseness in (0.2, 0.4):
-        verdict = judge(replace(holdout, coarseness=coarseness), unlike_noise=unlike_noise)
-        assert verdict.word == "MODEL_MISMATCH"
-        assert ("the timestep of the model is too long" in verdict.sentence) == (coarseness > 0.25)
-    assert "of half of the signals change by 0.4 typical changes or more" in verdict.sentence
-    assert judge(replace(PREDICTED, coarseness=0.4)).word == "CALIBRATED"

@@ -9,7 +9,6 @@ from typing import Annotated, Literal, TypeAlias
 
 from pydantic import Field
 
-from madoc.identification.concentration import Concentration
 from madoc.identification.term_tests import Alternative, ImitatedTerm, MissingTerm
 
 Word = Literal["CALIBRATED", "USABLE", "NO_IMPROVEMENT", "NOT_IDENTIFIABLE", "MODEL_MISMATCH", "DATA_REJECTED"]
@@ -169,11 +168,7 @@ class Judged:
         at_end: Parameters estimated at an end of their range that is no physical bound, but for those that are open.
         open_at_end: Open parameters at such an end that without the alternatives would not be open.
         contradictions: Sentences of the check of the log that contradict the spec, such as actions that come late.
-        coarseness: By how many typical changes predictions one stride ahead change where the model is integrated in
-            steps of a quarter of the length, the median over signals; 0 for a robot without a spec.
         open_loop: Errors of open-loop predictions in the signals' units, the shortest first; none without states.
-        concentration: Where in the log that was calibrated to most of what the model leaves unexplained is; None where
-            that was not looked for or no place stands out.
     """
 
     split: str
@@ -194,9 +189,7 @@ class Judged:
     at_end: tuple[str, ...] = ()
     open_at_end: tuple[str, ...] = ()
     contradictions: tuple[str, ...] = ()
-    coarseness: float = 0.0
     open_loop: tuple[OpenLoop, ...] = ()
-    concentration: Concentration | None = None
 
     @property
     def ahead(self) -> OpenLoop | None:

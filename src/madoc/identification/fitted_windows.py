@@ -39,6 +39,8 @@ SHORTER = 4
 far more than noise: it adds up over a window and hides itself then, and noise hides less."""
 NEGLIGIBLE = 1e-5
 """Residual in typical changes of a stride; below it there is nothing to explain."""
+LEAST = 1e-3
+"""Residual in typical changes of a stride; no sensor is more precise, so smaller ones are alike by chance."""
 LINEARISATIONS = 4
 """Largest number of times that derivatives are simulated anew in a fit."""
 STEPS = 4
@@ -291,6 +293,16 @@ def negligible(slopes: WindowSlopes) -> bool:
 def noise_of(fit: Fit, readings: Readings) -> Float[np.ndarray, " channels"]:
     """Standard deviation of each channel's noise in its typical changes, by what a fit leaves of its windows."""
     return _noise(fit.left, fit.spare, fit.slopes.whole, readings)[: len(readings.scale)]
+
+
+def alike(fit: Fit, readings: Readings) -> float:
+    """Correlation of what a fit leaves of a reading with what it leaves of the next, all signals in typical changes.
+
+    It is about 0 for noise. What is smaller than `LEAST` counts as 0.
+    """
+    left = fit.left[fit.counted & fit.slopes.whole].reshape(-1, *readings.observed.shape[1:])
+    square = max(float((left**2).sum()), LEAST**2 * max(1, left.size))
+    return float((left[:, 1:] * left[:, :-1]).sum()) / square
 
 
 def _noise(

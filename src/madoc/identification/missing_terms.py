@@ -24,11 +24,11 @@ from madoc.identification.candidate_terms import (
     is_late,
     of_steps,
 )
-from madoc.identification.concentration import alike, concentration
 from madoc.identification.drifts import drifts_of
 from madoc.identification.fitted_windows import (
     Fit,
     LoggedWindows,
+    alike,
     fit_log,
     fit_windows,
     negligible,
@@ -128,10 +128,9 @@ def suspicions(
     terms = [fitted.get(term.parameter, term) for term in terms]
     others += [*with_chosen, *_within_bounds(tests, chosen), *_of_forces(tests, chosen)]
     most_significant_first = sorted(terms, key=lambda term: -abs(term.t))
-    where = concentration(dataset, windows, fit, simulator.task.signal_names, simulator.control_step)
     found = tuple(most_significant_first), tuple(others), tuple(imitated_terms(tests))
     lasting = alike(_less_steps(fit, tests, by_terms), readings)
-    return Suspicions(*found, SIMULATED.control_steps - began, concentration=where, alike=lasting)
+    return Suspicions(*found, SIMULATED.control_steps - began, alike=lasting)
 
 
 def _less_steps(fit: Fit, tests: TermTests, by_terms: Float[np.ndarray, "windows values terms"]) -> Fit:

@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from madoc.identification.candidate_terms import DELAY, EARLY, INTEGRATION, UNLISTED, Candidate, of_steps
-from madoc.identification.concentration import Concentration
 from madoc.identification.score_tests import Products, Score, imitators, score
 from madoc.parameters import ParameterSpace
 
@@ -109,7 +108,6 @@ class Suspicions:
         imitated: Terms that the model has none of and of which the log cannot tell whether they are missing.
         control_steps: Control steps that were simulated to find that out.
         tested: Whether there were states to begin at, and enough windows.
-        concentration: Where most of what the model leaves unexplained is; None where no place stands out.
         alike: Correlation of what the fitted model leaves of a reading with what it leaves of the next; 0 for noise.
     """
 
@@ -118,7 +116,6 @@ class Suspicions:
     imitated: tuple[ImitatedTerm, ...] = ()
     control_steps: int = 0
     tested: bool = True
-    concentration: Concentration | None = None
     alike: float = 0.0
 
 

@@ -8,7 +8,6 @@ from jaxtyping import Float
 
 from madoc.calibration.holdout import HoldOut, Judged, JudgedByErrors
 from madoc.calibration.result import CalibrationResult
-from madoc.diagnosis.scales import COARSE
 from madoc.identification.candidate_terms import DELAY, EARLY, INTEGRATION, TILTS, UNLISTED, is_late, of_steps
 from madoc.identification.combinations import Combination
 from madoc.identification.drifts import ONE_RUN, WITHIN_RUNS, is_change
@@ -20,13 +19,6 @@ from madoc.verdict.statistics import beyond_noise
 
 CERTAIN = 5.0
 """|t| from which a term is missing; by chance one in two million is larger where residuals are normal."""
-CERTAIN_DRIFT = 6.0
-"""The same for a parameter that changes over the log or within each run: its standard error may rest on a third of the
-windows, and many changes are looked for."""
-CERTAIN_STEP = 4.0
-"""t of the error of the integration step, whose value is known beforehand; by chance one in 30 thousand is larger."""
-MOVES = 0.5
-"""Shift of a parameter in half-widths of its 95 % interval, from which a term is named before others."""
 SMALLEST = 0.3
 """Smallest value of the error of the integration step in proportion to which its effects are taken larger."""
 NUMERICAL = 0.3
@@ -35,12 +27,8 @@ IN_TIME = 0.25
 """Delay of actions in control steps; a shorter one is none."""
 SURELY = 3.0
 """Standard errors of a delay's value that exclude a longer one."""
-AS_SIGNIFICANT = 0.6
-"""|t| over that of the most significant term; among terms above it the one that explains most is named."""
 NEARLY = 0.8
 """Share explained by a term over that of the one named; terms above it are as likely."""
-HALF = 0.5
-"""Share explained by a listed term over that of forces that are not listed, from which these are not named."""
 WORTH_NAMING = 0.02
 """Share in [0, 1] of the squared residuals that a term must explain to be named as what the model lacks."""
 SURER = 1.314
@@ -50,17 +38,15 @@ NAMED = 3
 
 
 def missing_term(holdout: Judged, least: float | None = None) -> MissingTerm | None:
-    """The likeliest term that the model certainly lacks, of those that move the estimate if there are any.
+    """The likeliest term that the model certainly lacks.
 
-    One that moves nothing counts too: what it would move is known to first order, at an estimate that may be wrong.
+    One that moves no estimate counts too: what it would move is known to first order, at an estimate that may be wrong.
     A force or a value that explains less than a share `least` of the squared residuals does not, `worth_naming` by
     default: where errors are those of noise, intervals cover the estimate with it, and where they are far beyond noise
     something else makes them.
     """
     least = worth_naming(holdout.missing_terms) if least is None else least
-    certain = [term for term in holdout.missing_terms if is_certain(term) and not _is_small(term, least)]
-    moving = [term for term in certain if max(map(abs, term.shifts.values())) >= MOVES]
-    return likeliest(moving or certain)
+    return likeliest([term for term in holdout.missing_terms if is_certain(term) and not _is_small(term, least)])
 
 
 def worth_naming(terms: Sequence[MissingTerm]) -> float:
@@ -97,19 +83,17 @@ def far_beyond_noise(holdout: Judged) -> bool:
 
 
 def likeliest(terms: Sequence[MissingTerm]) -> MissingTerm | None:
-    """Of significant terms the one that explains most, or nearly as much if that is unusual; None of none.
+    """Of certain terms the one that explains most, or nearly as much if that is unusual; None of none.
 
     A tilted base looks like an offset of a sensor, which is more usual. Actions that seem to come early are more often
     a sign of forces that the model lacks, and values that change within each run may be one of motions that do. A force
     that no parameter adds is named only where no other term explains nearly as much, and one that is not listed only
-    where no listed one explains half as much.
+    where no listed one does.
     """
-    explained = max((term.explained for term in terms if not _unlisted(term)), default=0.0)
-    terms = [term for term in terms if not _unlisted(term) or explained < HALF * term.explained]
-    most = max((abs(term.t) for term in terms), default=0.0)
-    significant = [term for term in terms if abs(term.t) >= AS_SIGNIFICANT * most]
-    enough = NEARLY * max((term.explained for term in significant), default=0.0)
-    likely = [term for term in significant if term.explained >= enough]
+    listed = max((term.explained for term in terms if not _unlisted(term)), default=0.0)
+    terms = [term for term in terms if not _unlisted(term) or listed < NEARLY * term.explained]
+    enough = NEARLY * max((term.explained for term in terms), default=0.0)
+    likely = [term for term in terms if term.explained >= enough]
     return max(likely, key=lambda term: (not _unusual(term), term.explained), default=None)
 
 
@@ -135,39 +119,15 @@ def as_likely(terms: Sequence[MissingTerm], named: MissingTerm) -> list[MissingT
     ]
 
 
-def coarse_step(holdout: HoldOut, term: MissingTerm) -> MissingTerm | None:
-    """The error of the integration step, where it is certain and explains more than the term named."""
-    step = integration(holdout.missing_terms)
-    coarse = step is not None and step.t >= CERTAIN and step.explained > term.explained
-    return step if coarse else None
-
-
-def about_timestep(holdout: HoldOut, named: MissingTerm | None = None) -> str:
-    """A clause that the model should be integrated more finely first, or none.
-
-    That is so where it changes predictions by much, or explains more than the term named.
-    """
-    if holdout.coarseness > COARSE:
-        return (
-            "; the timestep of the model is too long, as with a quarter of it predictions of half of the signals "
-            f"change by {holdout.coarseness:.2g} typical changes or more: take a smaller one before anything else"
-        )
-    step = None if named is None else coarse_step(holdout, named)
-    if step is None:
-        return ""
-    explains = f"explains {100 * step.explained:.2g} % (t = {abs(step.t):.0f})"
-    return f"; first take a smaller timestep of the model, whose error {explains}"
-
-
 def is_certain(term: MissingTerm) -> bool:
     """Whether a term is so significant that it is missing, whatever it does to the estimate."""
-    return term.cause != INTEGRATION and abs(term.t) >= (CERTAIN_DRIFT if is_change(term.cause) else CERTAIN)
+    return term.cause != INTEGRATION and abs(term.t) >= CERTAIN
 
 
 def numerical(terms: Sequence[MissingTerm]) -> MissingTerm | None:
     """The error of the integration step, where it explains much of the residuals, and no certain term explains more."""
     step = integration(terms)
-    if step is None or step.t < CERTAIN_STEP or step.explained < NUMERICAL:
+    if step is None or step.t < CERTAIN or step.explained < NUMERICAL:
         return None
     others = (each.explained for each in terms if is_certain(each) and not is_change(each.cause))
     return step if max(others, default=0.0) <= step.explained else None

@@ -8,7 +8,7 @@ from madoc.calibration.holdout import Area, Fitted, HoldOut, PredictionErrors, T
 from madoc.identification.candidate_terms import UNLISTED
 from madoc.identification.drifts import ONE_RUN, WITHIN_RUNS, is_change
 from madoc.identification.term_tests import MissingTerm, named
-from madoc.verdict.adequacy import about_timestep, as_likely, far_beyond_noise, missing_term, numerical
+from madoc.verdict.adequacy import as_likely, far_beyond_noise, missing_term, numerical
 from madoc.verdict.remedies import WARM_UP, addition, is_of_spec, remedy, value_of
 from madoc.verdict.statistics import NEGLIGIBLE
 
@@ -40,7 +40,7 @@ def _missing(holdout: HoldOut, term: MissingTerm | None) -> Verdict | None:
         return None
     value = value_of(term)
     if is_change(term.cause):
-        return Verdict("MODEL_MISMATCH", f"{_changing(holdout, term)}{about_timestep(holdout)}", (term.parameter,))
+        return Verdict("MODEL_MISMATCH", _changing(holdout, term), (term.parameter,))
     moved = sorted(term.shifts, key=lambda name: -abs(term.shifts[name]))[:2]
     effect = " and ".join(_moved(holdout, term, name) for name in moved)
     sure = _proved(holdout, term) or term.cause.startswith(UNLISTED)
@@ -48,7 +48,7 @@ def _missing(holdout: HoldOut, term: MissingTerm | None) -> Verdict | None:
     return Verdict(
         "MODEL_MISMATCH",
         f"{lacks} {named(term)}: a value of {value} explains {100 * term.explained:.2g} % of the squared residuals "
-        f"(t = {abs(term.t):.0f}), and would move {effect}{about_timestep(holdout, term)}; {_advice(holdout, term)}"
+        f"(t = {abs(term.t):.0f}), and would move {effect}; {_advice(holdout, term)}"
         f"{_at_end(holdout)}{_disagreeing(holdout)}",
         tuple(moved),
     )
@@ -134,9 +134,7 @@ def contradicted(holdout: HoldOut) -> Verdict | None:
     """A log that the check before the calibration found to contradict the spec."""
     if not holdout.contradictions:
         return None
-    return Verdict(
-        "MODEL_MISMATCH", f"the log contradicts the spec: {holdout.contradictions[0]}{about_timestep(holdout)}"
-    )
+    return Verdict("MODEL_MISMATCH", f"the log contradicts the spec: {holdout.contradictions[0]}")
 
 
 def _outside(holdout: HoldOut) -> Verdict | None:
@@ -146,7 +144,7 @@ def _outside(holdout: HoldOut) -> Verdict | None:
     return Verdict(
         "MODEL_MISMATCH",
         f"{', '.join(holdout.at_end)} at the end of the range: the true value may lie beyond it, and then the other "
-        f"parameters make up for it; widen the range{about_timestep(holdout)}",
+        "parameters make up for it; widen the range",
         holdout.at_end,
     )
 
@@ -158,10 +156,9 @@ def _unlike_noise(holdout: HoldOut) -> Verdict | None:
     return Verdict(
         "MODEL_MISMATCH",
         "residuals are unlike noise (a warning says in what): the model does not explain the whole log, and intervals "
-        f"count noise alone{_where(holdout)}; look for a force that depends on the motion, as drag does, or acts at "
+        "count noise alone; look for a force that depends on the motion, as drag does, or acts at "
         "times only, at contacts or in fast motion, for wrong or missing readings and for values that differ between "
-        "runs"
-        f"{about_timestep(holdout)}",
+        "runs",
     )
 
 
@@ -175,7 +172,7 @@ def _mismatch(holdout: HoldOut) -> Verdict | None:
         sentence = _from_fitted_starts(holdout)
     if not sentence:
         return None
-    return Verdict("MODEL_MISMATCH", f"{sentence}{about_timestep(holdout)}", holdout.at_end)
+    return Verdict("MODEL_MISMATCH", sentence, holdout.at_end)
 
 
 def _from_fitted_starts(holdout: Fitted) -> str:
@@ -194,21 +191,8 @@ def _from_fitted_starts(holdout: Fitted) -> str:
     return (
         f"the model cannot explain the data: after {in_rows(left.steps)} from a fitted start even the parameters "
         f"nearby that fit the hold-out best err by {left.mean:.2g} of what a signal changes in "
-        f"{in_rows(errors.stride)}, {much} ({change_of(errors)}){_where(holdout)}{_at_end(holdout)}"
+        f"{in_rows(errors.stride)}, {much} ({change_of(errors)}){_at_end(holdout)}"
     )
-
-
-def _where(holdout: HoldOut) -> str:
-    """A clause on the place in the log that was calibrated to where most of what the model leaves is, or none."""
-    found = holdout.concentration
-    if found is None:
-        return ""
-    places = [f"in {found.signal}"] if found.signal else []
-    if found.share:
-        time = "" if found.seconds is None else f" from {found.seconds[0]:.3g} to {found.seconds[1]:.3g} s"
-        run = f" of {found.run}" if found.run and time else found.run
-        places.append(f"in the rows{time}{run}" if time else f"in {run}")
-    return f"; most of what it leaves in the log that was calibrated to is {' and '.join(places)}"
 
 
 def _separable(holdout: ToldApart) -> str:

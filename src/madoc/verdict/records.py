@@ -12,7 +12,6 @@ from jaxtyping import Float
 from madoc.calibration.holdout import AgainstChance, Judged, RicherModel
 from madoc.data.findings import Finding
 from madoc.diagnosis.exchanged_columns import exchanged_columns
-from madoc.diagnosis.scales import coarseness
 from madoc.diagnosis.speeds import rates_contradict
 from madoc.identification.candidate_terms import DELAY, INTEGRATION, LAG
 from madoc.identification.excitation import WINDOWS, expected_half_widths
@@ -117,9 +116,7 @@ def judged(
     own = best
     if interval is not None:  # to the farther end, as the other may be cut off at an end of the range
         own = np.maximum(np.abs(space.to_unit(interval.T) - point).max(0), 1e-9)
-    coarse, exchanged = 0.0, _exchanged(bench, point, at)  # tests take what is left of the time
-    if bench.simulator.task.source is not None and bench.begins("the length of the timestep"):
-        coarse = coarseness(problem.dataset, bench.states, problem.simulator, point, bench.change)
+    exchanged = _exchanged(bench, point, at)  # tests take what is left of the time
     testing = bench.for_tests
     doubts = _doubts(testing, point, own)
     # Actions that seem late are none where tests at the estimate exclude it.
@@ -152,10 +149,8 @@ def judged(
         imitated=doubts.imitated,
         tested=doubts.tested and EXCHANGED not in bench.left_out,
         open_in_time=tuple(itertools.compress(space.names, (shares >= OPEN) & (narrower < OPEN))),
-        coarseness=coarse,
         at_end=tuple(space.names[index] for index in at_end if narrower[index] < OPEN),
         open_at_end=tuple(space.names[index] for index in at_end if by_noise[index] < OPEN <= narrower[index]),
-        concentration=doubts.concentration,
     )
     shorter = SHORTER if far_beyond_noise(found) and missing_term(found) is None else 1
     if shorter > 1:
