@@ -195,6 +195,14 @@ def test_terms_that_explain_nearly_as_much_are_as_likely():
     assert as_likely(held(friction, term("another gain", t=4.0, explained=0.5)).missing_terms, friction) == []
 
 
+def test_a_coarse_integration_step_that_explains_more_is_told_first():
+    step, friction = term(INTEGRATION, t=6.0, explained=0.1, parameter=""), term(explained=0.05)
+    first = "; first take a smaller timestep of the model, whose error explains 10 % (t = 6)"
+    assert first in judge(held(step, friction)).sentence
+    for terms in ((step, term(explained=0.2)), (replace(step, t=4.0), friction), (replace(step, value=3.5), friction)):
+        assert "take a smaller timestep" not in judge(held(*terms)).sentence
+
+
 def test_a_force_of_two_shapes_is_no_rival_of_itself():
     sine, cosine = (
         term("a drive whose gain depends on where the joint is (hip)", t=t, parameter="") for t in (9.0, 8.0)

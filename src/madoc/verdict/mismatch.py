@@ -8,7 +8,7 @@ from madoc.calibration.holdout import Area, Fitted, HoldOut, PredictionErrors, T
 from madoc.identification.candidate_terms import UNLISTED
 from madoc.identification.drifts import ONE_RUN, WITHIN_RUNS, is_change
 from madoc.identification.term_tests import MissingTerm, named
-from madoc.verdict.adequacy import as_likely, far_beyond_noise, missing_term, numerical
+from madoc.verdict.adequacy import CERTAIN, as_likely, far_beyond_noise, integration, missing_term, numerical
 from madoc.verdict.remedies import WARM_UP, addition, is_of_spec, remedy, value_of
 from madoc.verdict.statistics import NEGLIGIBLE
 
@@ -48,10 +48,19 @@ def _missing(holdout: HoldOut, term: MissingTerm | None) -> Verdict | None:
     return Verdict(
         "MODEL_MISMATCH",
         f"{lacks} {named(term)}: a value of {value} explains {100 * term.explained:.2g} % of the squared residuals "
-        f"(t = {abs(term.t):.0f}), and would move {effect}; {_advice(holdout, term)}"
+        f"(t = {abs(term.t):.0f}), and would move {effect}{_coarser(holdout, term)}; {_advice(holdout, term)}"
         f"{_at_end(holdout)}{_disagreeing(holdout)}",
         tuple(moved),
     )
+
+
+def _coarser(holdout: HoldOut, term: MissingTerm) -> str:
+    """A clause on the error of the integration step, where it is certain and explains more than the term; or none."""
+    step = integration(holdout.missing_terms)
+    if step is None or step.t < CERTAIN or step.explained <= term.explained:
+        return ""
+    explains = f"explains {100 * step.explained:.2g} % (t = {abs(step.t):.0f})"
+    return f"; first take a smaller timestep of the model, whose error {explains}"
 
 
 def _moved(holdout: HoldOut, term: MissingTerm, name: str) -> str:
