@@ -1,17 +1,14 @@
 """Positions and speeds compared: the true rate of rows, and speeds that come late."""
 
-import jax
 import numpy as np
 import pytest
 from logged_arm import arm_of, write_csv
 from mujoco_log import recorded
 
-from madoc import robots, simulation
+from madoc import simulation
 from madoc.data import logs
 from madoc.diagnosis import speeds
-from madoc.diagnosis.speeds import impacts, rates_contradict, speed_findings
-from own_robots import write_robot
-from robots import recorded as recorded_robot
+from madoc.diagnosis.speeds import impacts, speed_findings
 
 
 @pytest.fixture
@@ -88,52 +85,6 @@ def test_joints_that_move_in_one_part_of_the_log_alone(told, trembling):
         columns[name] = 0.1 * (1.0 - np.cos(phase)) + trembling * np.sin(time)
         columns[f"{name}_speed"] = 0.2 * np.pi * np.sin(phase) + trembling * np.cos(time)
     assert told(columns) == ([], False)
-
-
-SERVO = """
-<mujoco>
-  <option timestep="0.002" integrator="implicitfast"/>
-  <worldbody><body name="fin"><joint name="fin" type="hinge" axis="0 0 1" damping="0.08"/>
-    <geom type="box" size="0.1 0.01 0.01" mass="0.1"/></body></worldbody>
-  <actuator><position name="servo" joint="fin" kp="1"/></actuator>
-</mujoco>
-"""
-SERVO_SPEC = """\
-madoc: 1
-name: servo
-model: servo.xml
-control_step: 0.02
-signals:
-  - {name: fin, reads: position(fin)}
-  - {name: fin_speed, reads: velocity(fin)}
-actions:
-  - {name: target, actuator: servo, low: -1, high: 1}
-parameters:
-  - {field: dof_damping, element: fin, low: 0.002, high: 0.4}
-"""
-
-
-def test_a_drive_that_follows_within_a_row_moves_faster_between_rows(tmp_path):
-    """The model at the truth says what positions of a log without noise change by beyond the mean of two speeds."""
-    task = robots.load(write_robot(tmp_path, SERVO_SPEC, servo=SERVO)).task
-    log, simulator = recorded_robot(task, {"dof_damping.fin": 0.04}, 200, jax.random.key(0)), simulation.make(task)
-    (pair,) = speeds._pairs(log, simulator)
-    within = speeds._within_rows(log, simulator, np.array([0.04]))
-    assert np.abs(within).max() > 0.5 * np.abs(pair.change).max()
-    np.testing.assert_allclose(pair.expected + within[:, pair.dof], pair.change, atol=1e-9)
-
-
-@pytest.mark.parametrize(("moves_so", "contradict"), [(0.0, True), (0.06, False)])
-def test_an_estimate_that_moves_so_refutes_other_rates_of_rows(tmp_path, monkeypatch, moves_so, contradict):
-    """Positions change by 6 % more than speeds say, and so do those of the model at the estimate, or not."""
-    robot = arm_of(tmp_path)
-    dataset = logs.read(write_csv(tmp_path / "log.csv", recorded(spacing=0.0212)), robot)
-    simulator = simulation.make(robot.task, threads=1)
-    (finding,), _ = speed_findings(dataset, simulator)
-    assert finding.of_rows and finding.contradicts
-    by_speed = np.stack([pair.expected for pair in speeds._pairs(dataset, simulator)], axis=-1)
-    monkeypatch.setattr(speeds, "_within_rows", lambda *_: moves_so * by_speed)
-    assert rates_contradict(dataset, simulator, simulator.parameters.middle) == contradict
 
 
 def test_impacts_are_left_out_and_steps_of_an_encoder_are_not():

@@ -9,7 +9,7 @@ from test_judge import PREDICTED
 from madoc.calibration.holdout import AgainstChance, Area, OpenLoop, ToldApart
 from madoc.calibration.result import CalibrationResult, ParameterEstimate
 from madoc.identification.body_forces import WEAKENING_ALL
-from madoc.identification.candidate_terms import DELAY, EARLY, INTEGRATION, LATE_DRIVE, TILTS, UNLISTED
+from madoc.identification.candidate_terms import INTEGRATION, TILTS, UNLISTED
 from madoc.identification.combinations import Combination
 from madoc.identification.drifts import DRIFT
 from madoc.identification.joint_forces import WEAKENING
@@ -18,7 +18,6 @@ from madoc.verdict import judge
 from madoc.verdict.adequacy import (
     SURER,
     about_imitated,
-    actions_in_time,
     as_likely,
     in_full,
     likeliest,
@@ -224,20 +223,3 @@ def test_a_term_beside_the_error_of_the_timestep_is_named_though_that_explains_m
     assert missing_term(held(replace(step, value=3.0), left)) == left  # nor one of another effect
     assert numerical([replace(step, explained=0.3), term(explained=0.31)]) is None
     assert numerical([replace(step, explained=0.29)]) is None and numerical([replace(step, t=3.9)]) is None
-
-
-@pytest.mark.parametrize(
-    ("cause", "value", "error", "other", "expected"),
-    [
-        (DELAY, 0.0001, 0.0005, 0.0, True),
-        (EARLY, -0.0001, 0.0005, 0.0, True),
-        (EARLY, -0.004, 0.0005, 0.0, False),  # neither late nor in time: something else is missing
-        (DELAY, 0.0001, 0.001, 0.0, False),  # up to 0.0031 s late, and a quarter of a control step is 0.0025 s
-        (DELAY, 0.0001, 0.0005, 0.004, False),  # one of the drives is late
-    ],
-)
-def test_tests_at_the_estimate_exclude_late_actions(cause, value, error, other, expected):
-    terms = [replace(term(cause, t=0.2), value=value, standard_error=error)]
-    terms.append(replace(term(f"{LATE_DRIVE} (hip)", t=4.0), value=other))
-    assert actions_in_time(terms, 0.01) == expected
-    assert not actions_in_time(terms[1:], 0.01)  # nothing is excluded where no delay was tested

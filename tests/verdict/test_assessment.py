@@ -14,7 +14,6 @@ from madoc import robots, simulation
 from madoc.calibration import CalibrationProblem, CalibrationResult, LeastSquares
 from madoc.calibration.least_squares import timestep
 from madoc.data.dataset import hold_out
-from madoc.data.findings import Finding
 from madoc.errors import MadocError
 from madoc.identification.candidate_terms import INTEGRATION
 from madoc.identification.term_tests import Alternative, Suspicions
@@ -84,20 +83,6 @@ def test_what_only_tests_on_few_windows_leave_open_asks_for_time(result, split, 
     few = madoc.assess(result, replace(bench, until=time.monotonic() + 1000.0, rate=rate))
     assert few.holdout.open_in_time == few.verdict.parameters == (name,)
     assert f"leaves {name} open; give it more time" in few.verdict.sentence
-
-
-@pytest.mark.parametrize(("contradict", "word"), [(True, "MODEL_MISMATCH"), (False, "CALIBRATED")])
-def test_other_rates_of_rows_count_unless_the_estimate_moves_so(result, split, monkeypatch, contradict, word):
-    rates = Finding(
-        "warning", "it changes 1.04 times as much as speed says", "position", contradicts=True, of_rows=True
-    )
-    asked = []
-    monkeypatch.setattr("madoc.verdict.records.rates_contradict", lambda *given: asked.append(given) or contradict)
-    warned = replace(result, warnings=[*result.warnings, rates.sentence])
-    found = madoc.assess(warned, split.held, training=replace(split.kept, findings=(rates,)))
-    assert found.verdict.word == word
-    assert (rates.sentence in found.result.warnings) == contradict
-    np.testing.assert_allclose(asked[0][2], result.mean)
 
 
 @pytest.mark.parametrize("tried", [False, True])

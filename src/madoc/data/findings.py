@@ -18,9 +18,7 @@ class Finding:
         where: A file, a row, a signal or a parameter; empty where it concerns the whole log.
         do: What to do about it; empty where nothing is to be done.
         contradicts: Whether the log contradicts the spec, so that no estimate from the two is to be trusted.
-        late: How late actions seem to take effect, s, where that is the finding; tests at an estimate may exclude it.
         rough: Whether it is a size that the log alone tells roughly, so that an estimate may refute it.
-        of_rows: Whether it says how far apart rows are; an estimate whose own motion says the same refutes it.
         kept: Whether a note is kept with results, as it bears on what estimates mean.
     """
 
@@ -29,9 +27,7 @@ class Finding:
     where: str = ""
     do: str = ""
     contradicts: bool = False
-    late: float = 0.0
     rough: bool = False
-    of_rows: bool = False
     kept: bool = False
 
     @property

@@ -20,8 +20,6 @@ LONGEST = 0.3
 """s; a lag is looked for up to this."""
 LATE = 0.25
 """Lag in control steps; a shorter one is not told."""
-CONTRADICTING = 0.5
-"""Lag in control steps from which a model without a delay is wrong, whatever its parameters."""
 CERTAIN = 5.0
 """Standard errors by which a lag or a response has to differ from 0 before it is told."""
 FAR = 3.0
@@ -137,7 +135,7 @@ def _lag_findings(response: Response, action: str, simulator: Simulator) -> list
     verb = "widen the range of the delay to" if known else "add the parameter"
     alike = "a limit of speed, a lag of the motor, a filter on the log or an elastic transmission"
     do = f"if it is a delay, {verb} {remedy}; {alike} would look alike"
-    return [Finding("warning", what, action, do, contradicts=lag >= CONTRADICTING * step, late=lag)]
+    return [Finding("warning", what, action, do)]
 
 
 def _gain_findings(response: Response, action: str, modelled: Float[np.ndarray, " points"]) -> list[Finding]:

@@ -1,6 +1,6 @@
 """Positions and speeds of a log compared: units, signs, wrapped angles, the rate of rows, speeds that come late."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -9,7 +9,6 @@ from scipy.stats import median_abs_deviation
 
 from madoc.data import Dataset
 from madoc.data.findings import Finding
-from madoc.identification.states import logged_states
 from madoc.simulation.base import Simulator
 from madoc.tasks import Task
 
@@ -59,7 +58,6 @@ class _Pair:
         position: Name of the signal of the position.
         speed: Name of the signal of the speed.
         change: Change of the position in each row, rad or m.
-        dof: Index of its degree of freedom.
         expected: That change by the speed: the mean of its two readings times the control step.
         places: The place of each row in its episode, from -0.5 to 0.5.
         starts: Rows at which an episode begins.
@@ -68,7 +66,6 @@ class _Pair:
 
     position: str
     speed: str
-    dof: int
     change: Float[np.ndarray, " rows"]
     expected: Float[np.ndarray, " rows"]
     places: Float[np.ndarray, " rows"]
@@ -113,34 +110,6 @@ def _compared(pairs: list[_Pair], control_step: float) -> tuple[list[Finding], l
     return findings, fits
 
 
-def rates_contradict(dataset: Dataset, simulator: Simulator, values: Float[np.ndarray, " parameters"]) -> bool:
-    """Whether positions do not change by speed times control step in the model at these physical values either.
-
-    Between two rows a joint may move faster than at either, as under a drive that follows its command within a row.
-    """
-    within = _within_rows(dataset, simulator, values)
-    pairs = [replace(pair, expected=pair.expected + within[:, pair.dof]) for pair in _pairs(dataset, simulator)]
-    fits = _compared(pairs, simulator.control_step)[1]
-    return not fits or 2 * len(fits) < len(pairs) or bool(_rate_findings(fits))
-
-
-def _within_rows(
-    dataset: Dataset, simulator: Simulator, values: Float[np.ndarray, " parameters"]
-) -> Float[np.ndarray, "rows dof"]:
-    """What positions change by in each row of the model beyond the mean of its two speeds, rad or m.
-
-    It is 0 in rows whose state cannot be rebuilt, and where the simulation fails.
-    """
-    states, rows = logged_states(dataset, simulator.task)
-    system, size = simulator.bind(values), simulator.task.model.nv
-    states = system.unbiased(states[None])
-    after = system.step(states, np.asarray(dataset.transitions.action, np.float64)[None, rows])
-    (change,), (speeds,) = (after - states)[..., :size], (after + states)[..., size : 2 * size]
-    beyond = np.zeros((len(dataset), size))
-    beyond[rows] = np.nan_to_num(change - 0.5 * speeds * simulator.control_step)
-    return beyond
-
-
 def _pairs(dataset: Dataset, simulator: Simulator) -> list[_Pair]:
     """The joints whose position and speed are signals of their own; none of a model with ball or free joints."""
     task = simulator.task
@@ -164,7 +133,7 @@ def _pairs(dataset: Dataset, simulator: Simulator) -> list[_Pair]:
         change = after[:, dof] - before[:, dof]
         first, last = before[:, model.nv + dof], after[:, model.nv + dof]
         expected = 0.5 * (first + last) * simulator.control_step
-        pairs.append(_Pair(position, speed, dof, change, expected, places - 0.5, starts, impacts(last - first)))
+        pairs.append(_Pair(position, speed, change, expected, places - 0.5, starts, impacts(last - first)))
     return pairs
 
 
@@ -273,13 +242,13 @@ def _rate_findings(fits: list[tuple[_Pair, _Fit]]) -> list[Finding]:
         what = f"it changes {fit.ratio:.4g} ± {2.0 * fit.ratio_error:.1g} times as much as {pair.speed} says"
         apart = f"{abs(100 * fit.deviation):.2g} % {'farther apart' if fit.ratio > 1.0 else 'closer together'}"
         remedy = f"rows {apart} than control_step would explain it, or another unit: check clock, units and gears"
-        findings.append(Finding("warning", what, pair.position, remedy, contradicts=True, of_rows=True))
+        findings.append(Finding("warning", what, pair.position, remedy))
     pair, fit = min(fits, key=lambda each: abs(each[1].drift))
     if abs(fit.drift) > max(SAME_RATE, CERTAIN * fit.drift_error) and _one_side([f.drift for _, f in fits]):
         begin, end = (fit.ratio + side * fit.drift / 2.0 for side in (-1.0, 1.0))
         what = f"it changes {begin:.3g} times as much as {pair.speed} says when a run begins, and {end:.3g} at its end"
         remedy = "the time between rows drifts, or a sensor's scale: check the recorder's clock"
-        findings.append(Finding("warning", what, pair.position, remedy, contradicts=True, of_rows=True))
+        findings.append(Finding("warning", what, pair.position, remedy))
     return findings
 
 

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from madoc.calibration.holdout import HoldOut, Judged, JudgedByErrors
 from madoc.calibration.result import CalibrationResult
-from madoc.identification.candidate_terms import DELAY, EARLY, INTEGRATION, TILTS, UNLISTED, is_late, of_steps
+from madoc.identification.candidate_terms import EARLY, INTEGRATION, TILTS, UNLISTED, is_late, of_steps
 from madoc.identification.combinations import Combination
 from madoc.identification.drifts import ONE_RUN, WITHIN_RUNS, is_change
 from madoc.identification.information import NORMAL_95
@@ -23,10 +23,6 @@ SMALLEST = 0.3
 """Smallest value of the error of the integration step in proportion to which its effects are taken larger."""
 NUMERICAL = 0.3
 """Share of squared residuals explained by the integration step; above it they are no mismatch of the model."""
-IN_TIME = 0.25
-"""Delay of actions in control steps; a shorter one is none."""
-SURELY = 3.0
-"""Standard errors of a delay's value that exclude a longer one."""
 NEARLY = 0.8
 """Share explained by a term over that of the one named; terms above it are as likely."""
 WORTH_NAMING = 0.02
@@ -131,16 +127,6 @@ def numerical(terms: Sequence[MissingTerm]) -> MissingTerm | None:
         return None
     others = (each.explained for each in terms if is_certain(each) and not is_change(each.cause))
     return step if max(others, default=0.0) <= step.explained else None
-
-
-def actions_in_time(terms: Sequence[MissingTerm], control_step: float) -> bool:
-    """Whether tests at the estimate exclude that actions take effect late or early by `IN_TIME` control steps or more.
-
-    A log alone may seem to tell that where joints stick, as under Coulomb friction, and a controller pushes on.
-    """
-    delays = [abs(term.value) + SURELY * term.standard_error for term in terms if term.cause in (DELAY, EARLY)]
-    late = any(is_late(term.cause) and term.t >= SUSPICIOUS and term.value >= IN_TIME * control_step for term in terms)
-    return bool(delays) and bool(max(delays) < IN_TIME * control_step) and not late
 
 
 def integration(terms: Sequence[MissingTerm]) -> MissingTerm | None:

@@ -105,10 +105,7 @@ def assess(
         combinations=widened.combinations,
     )
     better = beats_mid_range(holdout) or explains_all(holdout)
-    of_rows = {each.sentence for each in bench.problem.dataset.findings if each.of_rows}
-    refuted = of_rows.difference(holdout.contradictions)  # by the estimate's own motion
-    warnings = [each for each in widened.warnings if each not in refuted]
-    warnings += [*about_imitated(holdout), *([] if better else [NO_BETTER])]
+    warnings = [*widened.warnings, *about_imitated(holdout), *([] if better else [NO_BETTER])]
     if bench.left_out:
         warnings.append(
             f"the budget left no time for these parts of judging: {'; '.join(bench.left_out)} (give it a larger one)"

@@ -12,8 +12,7 @@ from jaxtyping import Float
 from madoc.calibration.holdout import AgainstChance, Judged, RicherModel
 from madoc.data.findings import Finding
 from madoc.diagnosis.exchanged_columns import exchanged_columns
-from madoc.diagnosis.speeds import rates_contradict
-from madoc.identification.candidate_terms import DELAY, INTEGRATION, LAG
+from madoc.identification.candidate_terms import INTEGRATION, LAG
 from madoc.identification.excitation import WINDOWS, expected_half_widths
 from madoc.identification.fitted_windows import SHORTER, windows_of
 from madoc.identification.information import OPEN
@@ -22,7 +21,6 @@ from madoc.identification.term_tests import Alternative, MissingTerm, Suspicions
 from madoc.identification.windows import horizons
 from madoc.parameters import ParameterSpace
 from madoc.verdict.adequacy import (
-    actions_in_time,
     far_beyond_noise,
     in_full,
     is_certain,
@@ -31,7 +29,7 @@ from madoc.verdict.adequacy import (
     widening,
 )
 from madoc.verdict.bench import Bench
-from madoc.verdict.remedies import is_of_spec, remedy
+from madoc.verdict.remedies import is_of_spec
 from madoc.verdict.richer import Tested, in_turn, richer_model
 from madoc.verdict.statistics import NEGLIGIBLE
 
@@ -44,8 +42,6 @@ EXCHANGED = "exchanged columns"
 """A part of judging without which nothing is tested."""
 FEWER = "tests on as many windows as usual"
 """A part of judging; on fewer windows more terms seem possible, and intervals cover what they would change."""
-NO_DELAY = "look for a limit of speed or a filter of the drives or of the log before you add a delay to the spec"
-"""What to do where actions take effect late, and delays and lags leave something over or were not tested."""
 _DELAYED = "action_delay"
 BEFORE_OTHERS = 2.0
 """Time left over that of a test, from which it comes before what is to follow, as predictions over longer times."""
@@ -119,14 +115,7 @@ def judged(
     exchanged = _exchanged(bench, point, at)  # tests take what is left of the time
     testing = bench.for_tests
     doubts = _doubts(testing, point, own)
-    # Actions that seem late are none where tests at the estimate exclude it.
-    in_time = actions_in_time(doubts.terms, bench.simulator.control_step)
-    against = (each for each in (*exchanged, *problem.dataset.findings) if each.contradicts)
-    contradicting = tuple(each for each in against if not (each.late and in_time))
-    if any(each.of_rows for each in contradicting) and bench.states_known:
-        values = space.to_physical(np.clip(point, -1.0, 1.0))
-        if not rates_contradict(problem.dataset, problem.simulator, values):
-            contradicting = tuple(each for each in contradicting if not each.of_rows)
+    against = [each for each in (*exchanged, *problem.dataset.findings) if each.contradicts]
     ends = point[:, None] + np.outer(own, (-1.0, 1.0)) if interval is None else space.to_unit(interval.T).T
     widths = space, point[:, None] + np.outer(best, (-1.0, 1.0)), ends, own
     shares = _shares(*widths, doubts.alternatives)
@@ -157,12 +146,10 @@ def judged(
         doubts = _doubts(testing, point, own, shorter)
         found = _told_apart(found, doubts)
     unexplained = far_beyond_noise(found) and missing_term(found) is None
-    contradicting = tuple(each for each in contradicting if unexplained or not each.rough)
-    late = next((each for each in contradicting if each.late), None)
-    term = missing_term(found) if late is None else _delay(doubts, late)
+    told = tuple(each.sentence for each in against if unexplained or not each.rough)
+    term = missing_term(found)
     tested = partial(_richer, testing, point, own, doubts=doubts, shorter=shorter)
     richer = tested(term)
-    with_lag = None
     if term is not None and richer is not None and richer.left and term.parameter.startswith(_DELAYED):
         lag = replace(term, cause=LAG, parameter=term.parameter.replace(_DELAYED, "action_lag", 1))
         with_lag = tested(lag)
@@ -170,8 +157,6 @@ def judged(
             same = (term.cause, term.parameter)
             terms = tuple(lag if (each.cause, each.parameter) == same else each for each in found.missing_terms)
             found, term, richer = replace(found, missing_terms=terms), lag, with_lag
-    tried = [name for name, model in (("constant delay", richer), ("lag of first order", with_lag)) if model]
-    told = tuple(_contradiction(each, term, richer, tried) for each in contradicting)
     return replace(found, richer=richer, contradictions=told)
 
 
@@ -200,19 +185,6 @@ def _told_apart(found: Measure, doubts: Suspicions) -> Measure:
     return replace(found, missing_terms=terms) if doubts.tested else found
 
 
-def _delay(doubts: Suspicions, late: Finding) -> MissingTerm | None:
-    """The delay of all actions or of the late one, with the value that the check of the log found if that is larger.
-
-    Its range is twice that at most: a state carries an action for every control step of it.
-    """
-    terms = [term for term in doubts.terms if term.cause == DELAY or term.parameter == f"{_DELAYED}.{late.where}"]
-    if not terms:
-        return None
-    term = max(terms, key=lambda term: abs(term.t))
-    value = max(term.value, late.late)
-    return replace(term, value=value, standard_error=min(term.standard_error, value / 4.0))
-
-
 def _richer(
     bench: Bench,
     point: Float[np.ndarray, " d"],
@@ -234,16 +206,6 @@ def _richer(
         return richer_model(*given, terms, most=_windows_in_time(bench), shorter=shorter)
 
     return in_turn(term, tested)
-
-
-def _contradiction(finding: Finding, term: MissingTerm | None, richer: RicherModel | None, tried: Sequence[str]) -> str:
-    """A finding that contradicts the spec, with what to do; for late actions, by what was `tried` for them."""
-    if not finding.late:
-        return finding.sentence
-    if term is not None and richer is not None and not richer.left:
-        return replace(finding, do=f"a {tried[-1]} explains it: {remedy(term)}").sentence
-    left = f"no {' and no '.join(tried)} explains it" if tried else "whether a delay explains it was not tested"
-    return f"{replace(finding, do='').sentence}; {left}: {NO_DELAY}"
 
 
 def _best_half_widths(
