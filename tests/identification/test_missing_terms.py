@@ -18,8 +18,6 @@ from madoc.identification.drifts import (
     _between_runs,
     _drifts,
     _in_one_run,
-    _of_fitted_runs,
-    _Part,
 )
 from madoc.identification.joint_forces import LOADED
 from madoc.identification.score_tests import Products
@@ -104,7 +102,7 @@ def test_a_parameter_that_changes_over_the_log_is_told_with_its_change(tmp_path)
     dataset, simulator = plant(tmp_path, damping=0.3)
     drifts = [term for term in scores(dataset, simulator) if term.cause == DRIFT]
     assert drifts[0].parameter == "dof_damping.hinge"
-    assert drifts[0].value == pytest.approx(0.2, abs=3.0 * drifts[0].standard_error)
+    assert drifts[0].value == pytest.approx(0.2, rel=0.1)  # large residuals count less, so a change comes out smaller
     assert drifts[0].t > 6.0
 
 
@@ -140,22 +138,6 @@ def test_a_parameter_that_alternates_from_run_to_run_is_told():
         assert bool(others) == (apart > 0.0)
     assert term.value == pytest.approx(0.5, rel=0.2)  # the range is 2 wide, so 0.5 in [-1, 1] is 0.5 m/s²
     assert others[0].errors["gravity"] == pytest.approx(1.96 * 0.5 * np.sqrt(1.0 + 1.0 / 11.0) / 0.01, rel=0.2)
-
-
-def test_values_of_runs_fitted_by_themselves_are_covered():
-    """By hand: values of 0.1 and 0.3, whose variance is 4/3 of 0.01, in each of which 0.0012 is error."""
-    tests = TermTests(
-        Products(np.zeros((1, 2, 2)), 1),
-        (),
-        ParameterSpace((Parameter("gravity", "", -11, -9),)),
-        np.array([0.01]),
-        None,
-    )
-    runs = [_Part(np.array([value]), np.array([0.0012]), 5) for value in (0.1, 0.3, 0.1, 0.3)]
-    (found,) = _of_fitted_runs(tests, runs, ["gravity"], np.array([0.1]))
-    assert found.shifts["gravity"] == pytest.approx(10.0)
-    assert found.errors["gravity"] == pytest.approx(1.96 * np.sqrt(0.04 / 3.0 - 0.0012) / 0.01, rel=1e-3)
-    assert not list(_of_fitted_runs(tests, runs[:3], ["gravity"], np.array([0.1])))
 
 
 def test_a_parameter_that_changes_within_each_run_is_told():

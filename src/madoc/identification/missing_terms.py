@@ -113,7 +113,7 @@ def suspicions(
         return Suspicions(control_steps=SIMULATED.control_steps - began, tested=negligible(both))
     tests = TermTests(products, tuple(tried), simulator.parameters, half_widths, runs[counted])
     beside = tests.less_steps()
-    drifts, others = drifts_of(beside, simulator, readings, runs, fit, point, dataset.names_of_runs)
+    drifts, others = drifts_of(beside, dataset.names_of_runs)
     of_rest = (*_below_minimum(beside, led), *drifts)
     terms = [*_terms(tests), *(replace(each, explained=tests.beside_steps * each.explained) for each in of_rest)]
     unlisted, covering = unlisted_forces(tests, families(simulator, responses), readings, fit, by_terms, responses)
