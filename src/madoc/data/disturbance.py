@@ -14,7 +14,10 @@ Velocities = Literal["logged", "differences"]
 
 @dataclass(frozen=True)
 class Disturbance:
-    """Disturbances put into the data; an estimate made from it names them in its warnings."""
+    """Disturbances put into the data, to try methods; of a machine's log only --velocities may be of use.
+
+    An estimate made from it names them in its warnings.
+    """
 
     noise: float = 0.0
     """Observation noise as a share of a step's typical change: 0.1 is 10 %."""

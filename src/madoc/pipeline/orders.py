@@ -80,9 +80,9 @@ class Search:
     """Which parameters are calibrated, in which ranges, and by which method."""
 
     physics: Physics | None = None
-    """Physics of the simulator. Default: the data's; legacy where it does not say."""
+    """Physics of the simulator, of Madoc's own robots alone. Default: the data's; legacy where it does not say."""
     level: str = "normal"
-    """Ranges to search: easy, normal or hard."""
+    """Ranges to search, of Madoc's own robots alone: easy, normal or hard. A spec has its own."""
     parameters: tuple[str, ...] | None = None
     """Calibrate only these; the others stay at the model's own values. Default: all of the robot's."""
     method: str | None = None
@@ -143,7 +143,10 @@ class CheckOrder:
     """differences puts velocities from positions where the logs have none, as `calibrate` does if told so."""
     budget: int = 300_000
     """Control steps of Madoc to forecast the time of; least squares settles by itself."""
-    forecast: bool = True
+    forecast: Annotated[
+        bool,
+        arg(help="Do not forecast how long methods would take, the longest part of a check.", help_behavior_hint=""),
+    ] = True
     """Forecast how long methods would take: the longest part of a check."""
     seed: int = 0
     """Seed that chooses which stretches of the log are examined."""
@@ -247,7 +250,10 @@ class RunOrder:
     policy_budget: int | str | None = None
     """Simulated control steps for each policy, or updates of a learner that does not simulate; or a time, as 300s.
     Default: 2400000 for fast-sac and rlpd, else 300000."""
-    yardsticks: bool = True
+    yardsticks: Annotated[
+        bool,
+        arg(help="Learn no policy at mid-range, nor one at the truth where that is known.", help_behavior_hint=""),
+    ] = True
     """Learn also a policy at mid-range and one at the truth, where that is known."""
     episodes: int = 20
     """Episodes for the evaluation of each policy."""
