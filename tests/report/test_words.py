@@ -1,7 +1,10 @@
 import math
+from dataclasses import replace
 
 import pytest
+from run_folders import result
 
+from madoc.calibration import CalibrationResult
 from madoc.report.words import count, duration, memory, number, to_do, with_error
 
 
@@ -52,10 +55,23 @@ def test_an_error_has_two_digits_and_its_value_as_many_decimals(value, error, wo
     assert with_error(value, error) == words
 
 
+def result_of(word, *, status="converged", **changes):
+    """A result with a verdict, and a hold-out if that is changed."""
+    judged = {"verdict": {"word": word, "sentence": "s"}, "status": status}
+    found = CalibrationResult.from_json(result(**judged))
+    return replace(found, holdout=replace(found.holdout, **changes))
+
+
 def test_a_search_that_its_budget_has_ended_is_to_be_resumed_before_anything_else():
     """Only `USABLE` has something better than itself; what the other words ask for does not depend on the search."""
-    assert "; better, find what the model lacks" in to_do("USABLE", converged=True)
-    resumed = to_do("USABLE", converged=False)
+    assert "; better, find what the model lacks" in to_do(result_of("USABLE"))
+    resumed = to_do(result_of("USABLE", status="finished"))
     assert resumed.endswith("; better, resume the search with a larger budget (--resume, --budget)")
     assert resumed.startswith("use the calibrated model in MuJoCo as it is") and "lacks" not in resumed
-    assert to_do("NO_IMPROVEMENT", converged=False) == to_do("NO_IMPROVEMENT", converged=True)
+    assert to_do(result_of("NO_IMPROVEMENT", status="finished")) == to_do(result_of("NO_IMPROVEMENT"))
+
+
+@pytest.mark.parametrize("left", [{"tested": False}, {"open_in_time": ("gravity",)}])
+def test_what_was_not_tested_is_to_be_tested_before_anything_is_looked_for(left):
+    assert "; better, first give it what the verdict asks for" in to_do(result_of("USABLE", **left))
+    assert to_do(result_of("NOT_IDENTIFIABLE", **left)) == to_do(result_of("NOT_IDENTIFIABLE"))

@@ -62,10 +62,11 @@ def test_without_time_nothing_is_said_to_be_tested(result, split):
     bench = Bench(CalibrationProblem(split.kept, simulation.make(TASK, threads=1)), split.held, jax.random.key(0))
     found = madoc.assess(result, replace(bench, until=time.monotonic()))
     assert found.verdict.word == "NOT_IDENTIFIABLE" and not found.holdout.tested
+    assert "was not tested, as the budget left no time for that" in found.verdict.sentence
     assert found.holdout.open_loop == ()
     assert found.result.warnings[-1] == (
         "the budget left no time for these parts of judging: exchanged columns; tests of what the model lacks; "
-        "predictions over longer times (give it a larger one)"
+        "predictions over longer times (give it a larger one with --budget)"
     )
     in_full = madoc.assess(result, replace(bench, until=time.monotonic() + 1000.0, rate=1e5))
     assert max(in_full.holdout.open_loop[0].beside_noise.values()) < 1.3
@@ -82,7 +83,7 @@ def test_what_only_tests_on_few_windows_leave_open_asks_for_time(result, split, 
     rate = 1.01 * bench.windows_to_test * replace(bench, rate=1.0).window_seconds / 1000.0
     few = madoc.assess(result, replace(bench, until=time.monotonic() + 1000.0, rate=rate))
     assert few.holdout.open_in_time == few.verdict.parameters == (name,)
-    assert f"leaves {name} open; give it more time" in few.verdict.sentence
+    assert f"leaves {name} open; give it a larger budget" in few.verdict.sentence
 
 
 @pytest.mark.parametrize("tried", [False, True])

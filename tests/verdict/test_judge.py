@@ -266,10 +266,12 @@ def test_what_could_not_be_tested_or_stands_at_an_end_is_not_calibrated(good):
     untested, useful = replace(good, tested=False), {"open_loop": (predicted_over(1.0, 0.4, (0.3, 0.6)),)}
     assert judge(untested).word == "NOT_IDENTIFIABLE" and f", but {why}" in judge(untested).sentence
     assert good is TOLD_APART or judge(replace(untested, **useful)).word == "USABLE"
+    hurried = judge(untested, in_time=False).sentence
+    assert good is TOLD_APART or ("as the budget left no time" in hurried and "log more" not in hurried)
     assert judge(replace(good, at_end=("mass",))).word == "MODEL_MISMATCH"
     wide = replace(good, interval_shares={"mass": 0.9, "damping": 0.2}, **useful)
     few = judge(replace(wide, open_in_time=("mass",)))
-    assert judge(wide).word == "NOT_IDENTIFIABLE" and "give it more time" in few.sentence
+    assert judge(wide).word == "NOT_IDENTIFIABLE" and "give it a larger budget" in few.sentence
     assert good is TOLD_APART or few.word == "USABLE"
 
 

@@ -247,8 +247,7 @@ def calibration_text(result: "CalibrationResult") -> tuple[RenderableType, ...]:
     text = (result.table(), *(() if predictions is None else (predictions,)), result.summary())
     if result.verdict is None:
         return text
-    advice = to_do(result.verdict.word, converged=result.status == "converged")
-    return (str(result.verdict), *text, f"what to do: {advice}")
+    return (str(result.verdict), *text, f"what to do: {to_do(result)}")
 
 
 def calibration_status(result: "CalibrationResult") -> str:

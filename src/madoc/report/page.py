@@ -126,8 +126,7 @@ def headline(run: Run) -> Headline:
         return Headline((run.status or "NOT ENDED").upper(), "doubtful", sentence, run.sentence)
     if run.result.verdict is not None:
         verdict, word = run.result.verdict, run.result.verdict.word
-        advice = to_do(word, converged=run.result.status == "converged")
-        return Headline(word.replace("_", " "), TONES[word], verdict.sentence, run.sentence, advice)
+        return Headline(word.replace("_", " "), TONES[word], verdict.sentence, run.sentence, to_do(run.result))
     if run.result.status in _UNJUDGED:
         return Headline(run.result.status.upper(), *_UNJUDGED[run.result.status], run.sentence)
     sentence = "Nothing was held out, so this estimate was not tried on data it has not seen."

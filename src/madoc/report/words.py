@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 
-from madoc.calibration.result import ParameterEstimate
+from madoc.calibration.result import CalibrationResult, ParameterEstimate
 
 TONES = {
     "CALIBRATED": "good",
@@ -26,14 +26,25 @@ TO_DO = {
     "spec and the log; where it gives a line for the spec, add that line; then calibrate again",
     "DATA_REJECTED": "check the order of the rows, and which columns of the log the spec reads",
 }
-"""What to do first after each verdict of a search that has converged."""
-_RESUME = "better, resume the search with a larger budget (--resume, --budget)"
+"""What to do first after each verdict of a search that has converged, where all was tested."""
+_RESUME = "resume the search with a larger budget (--resume, --budget)"
+_TEST = (
+    "first give it what the verdict asks for, a larger budget (--budget) or more log: not all was tested that the "
+    "model may lack"
+)
 
 
-def to_do(word: str, *, converged: bool) -> str:
-    """What to do first after a verdict on a search that has converged, or that its budget has ended."""
-    first, _, then = TO_DO[word].partition("; better, ")
-    return f"{first}; {_RESUME}" if then and not converged else TO_DO[word]
+def to_do(result: CalibrationResult) -> str:
+    """What to do first after a verdict; of one without a verdict nothing."""
+    if result.verdict is None:
+        return ""
+    whole, holdout = TO_DO[result.verdict.word], result.holdout
+    first, better, then = whole.partition("; better, ")
+    if then and result.status != "converged":
+        return f"{first}{better}{_RESUME}"
+    if then and holdout is not None and (not holdout.tested or holdout.open_in_time):
+        return f"{first}{better}{_TEST}"
+    return whole
 
 
 _METRIC_WORDS = {

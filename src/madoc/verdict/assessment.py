@@ -20,10 +20,12 @@ from madoc.verdict.fitted import fitted
 from madoc.verdict.judge import beats_mid_range, explains_all, judge
 from madoc.verdict.open_loop import open_loop
 from madoc.verdict.predicted import noise_hides_gain, noisy_contacts, predicted
-from madoc.verdict.records import judged
+from madoc.verdict.records import EXCHANGED, judged
 
 LATER = "predictions over longer times"
 """A part of judging without which nothing is tested."""
+TESTING = frozenset({EXCHANGED, "tests of what the model lacks", LATER})
+"""All such parts."""
 NO_BETTER = "the estimate predicts the rows held out no better than mid-range does, so it is not settled"
 
 
@@ -102,13 +104,15 @@ def assess(
         settled=result.settled,
         unlike_noise=result.unlike_noise,
         effective=result.effective,
+        in_time=TESTING.isdisjoint(bench.left_out),
         combinations=widened.combinations,
     )
     better = beats_mid_range(holdout) or explains_all(holdout)
     warnings = [*widened.warnings, *about_imitated(holdout), *([] if better else [NO_BETTER])]
     if bench.left_out:
         warnings.append(
-            f"the budget left no time for these parts of judging: {'; '.join(bench.left_out)} (give it a larger one)"
+            f"the budget left no time for these parts of judging: {'; '.join(bench.left_out)} (give it a larger one "
+            "with --budget)"
         )
     settled = result.settled and better
     widened = replace(widened, verdict=verdict, holdout=holdout, warnings=warnings, settled=settled)

@@ -28,7 +28,7 @@ from madoc.verdict.mismatch import (
 from madoc.verdict.prediction import FEWEST_WINDOWS
 from madoc.verdict.statistics import ABOVE_NOISE, FEWEST_GROUPS, WORTH_GAINING, beyond_noise
 
-UNSETTLED = "the search had not settled when its budget ended: resume it with a larger one"
+UNSETTLED = "the search had not settled when its budget ended: resume it with a larger one (--resume, --budget)"
 EFFECTIVE = (
     "the model leaves more than noise, and other values predict better than those that explain short windows best: it "
     "seems to lack something, whose effect the estimates make up for"
@@ -60,6 +60,7 @@ def judge(
     settled: bool = True,
     unlike_noise: bool = False,
     effective: bool = False,
+    in_time: bool = True,
     combinations: Sequence[Combination] = (),
 ) -> Verdict:
     """The first verdict that applies: rejected data, a model that lacks something, open parameters, no improvement.
@@ -75,6 +76,7 @@ def judge(
         unlike_noise: Whether its residuals have longer tails than noise has, add up, are each like the next, or follow
             from state and action.
         effective: Whether the model leaves more than noise, and the estimate is the one that predicts best with it.
+        in_time: False where the budget left no time for a part of judging without which nothing is tested.
         combinations: What the log tells of parameters that it leaves open.
     """
     refused = _rejected(holdout) or contradicted(holdout)
@@ -88,7 +90,7 @@ def judge(
     return (
         _open(holdout, combinations)
         or _no_improvement(holdout)
-        or _untested(holdout)
+        or _untested(holdout, in_time=in_time)
         or _beyond_noise_later(holdout)
         or _small_but_certain(holdout)
         or (_not_certain(holdout, EFFECTIVE) if effective and numerical(holdout.missing_terms) is None else None)
@@ -181,23 +183,28 @@ def _open(holdout: HoldOut, combinations: Sequence[Combination]) -> Verdict | No
     )
 
 
-def _untested(holdout: HoldOut) -> Verdict | None:
+def _untested(holdout: HoldOut, *, in_time: bool) -> Verdict | None:
     if holdout.tested and not holdout.open_in_time:
         return None
     if holdout.tested:
         why = (
             "the budget left time for fewer tests than usual of what the model lacks, and what they do not exclude "
-            f"leaves {', '.join(holdout.open_in_time)} open; give it more time"
+            f"leaves {', '.join(holdout.open_in_time)} open; give it a larger budget (--budget)"
         )
     elif isinstance(holdout, ToldApart):
         why = (
             "the log tells no states, which testing whether the model lacks anything takes; log positions and "
             "velocities, or rows in their order"
         )
+    elif not in_time:
+        why = (
+            "whether the model lacks anything was not tested, as the budget left no time for that; give it a larger "
+            "one (--budget)"
+        )
     else:
         why = (
             "whether the model lacks anything was not tested: the log has too few windows that the model can follow, "
-            "or the budget was too short; log more, or in longer runs, or give it more time"
+            "or the budget was too short; log more, or in longer runs, or give it a larger budget (--budget)"
         )
     return _not_certain(holdout, why, holdout.open_in_time if holdout.tested else ())
 
@@ -265,7 +272,7 @@ def _no_improvement(holdout: HoldOut) -> Verdict | None:
         if sentence and errors.windows < FEWEST_WINDOWS and low <= 1.0 <= high:
             sentence = (
                 f"{_how_small(errors)}, but the {errors.windows} windows that there were time and rows for are too few "
-                "to tell whether that is chance; give it a larger budget, or hold out more"
+                "to tell whether that is chance; give it a larger budget (--budget), or hold out more (--holdout)"
             )
     return Verdict("NO_IMPROVEMENT", sentence) if sentence else None
 
@@ -313,7 +320,7 @@ def _no_better_errors(holdout: Predicted | Fitted) -> str:
         return ""
     return (
         f"{_how_small(errors)}, where parameters nearby leave {in_percent(errors.nearby_relative)}: the search is not "
-        "at its end; give it a larger budget or another method"
+        "at its end; give it a larger budget (--budget) or another method (--method)"
     )
 
 
