@@ -20,11 +20,11 @@ from madoc.verdict.fitted import fitted
 from madoc.verdict.judge import beats_mid_range, explains_all, judge
 from madoc.verdict.open_loop import open_loop
 from madoc.verdict.predicted import noise_hides_gain, noisy_contacts, predicted
-from madoc.verdict.records import EXCHANGED, judged
+from madoc.verdict.records import EXCHANGED, TESTS, judged
 
 LATER = "predictions over longer times"
 """A part of judging without which nothing is tested."""
-TESTING = frozenset({EXCHANGED, "tests of what the model lacks", LATER})
+TESTING = frozenset({EXCHANGED, TESTS, LATER})
 """All such parts."""
 NO_BETTER = "the estimate predicts the rows held out no better than mid-range does, so it is not settled"
 

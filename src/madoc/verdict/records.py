@@ -40,6 +40,8 @@ NARROWEST = 0.1
 """Share in (0, 1) of the time left that the narrowest intervals which the log allows may take."""
 EXCHANGED = "exchanged columns"
 """A part of judging without which nothing is tested."""
+TESTS = "tests of what the model lacks"
+"""Another such part."""
 FEWER = "tests on as many windows as usual"
 """A part of judging; on fewer windows more terms seem possible, and intervals cover what they would change."""
 _DELAYED = "action_delay"
@@ -67,7 +69,7 @@ def _doubts(
         return Suspicions(tested=False)
     given, most = (problem.dataset, bench.states), _windows_in_time(bench)
     enough = most is None or most >= bench.windows_to_test
-    part = "tests of what the model lacks" if shorter == 1 else "the same tests on shorter windows"
+    part = TESTS if shorter == 1 else "the same tests on shorter windows"
     if not bench.begins(part, 0.0 if enough else np.inf):
         return Suspicions(tested=False)
     usual = len(windows_of(*given, bench.change, fewest=bench.windows_to_test).rows)
