@@ -5,7 +5,8 @@ import pytest
 from test_noise import body_task
 from test_responses import WHOLE, of_windows
 
-from madoc.identification.body_forces import (
+from madoc.identification.body_forces import FreeBody, free_bodies, of_all_drives, on_body
+from madoc.identification.causes import (
     BENT_ALL,
     CUBIC_ALL,
     DEAD_ALL,
@@ -16,10 +17,6 @@ from madoc.identification.body_forces import (
     SLOWED,
     WEAKENING_ALL,
     WIND,
-    FreeBody,
-    free_bodies,
-    of_all_drives,
-    on_body,
 )
 from madoc.identification.responses import responses_of
 

@@ -6,7 +6,7 @@ from test_missing_terms import scores
 
 from madoc import robots, simulation
 from madoc.data import logs
-from madoc.identification.joint_forces import (
+from madoc.identification.causes import (
     BENT,
     BUILT_UP,
     CONSTANT,
@@ -18,9 +18,9 @@ from madoc.identification.joint_forces import (
     SLOW,
     UNEVEN,
     WEAKENING,
-    is_joint_force,
-    joint_forces,
+    cause_of,
 )
+from madoc.identification.joint_forces import joint_forces
 from madoc.verdict.adequacy import NEARLY, is_certain, likeliest
 from planted_pendulum import MODEL, NOISE, SPEC
 
@@ -93,8 +93,8 @@ def test_what_neither_moves_nor_drives_has_a_constant_force_alone():
 
 
 def test_causes_are_known_by_their_begin():
-    assert is_joint_force(f"{LOADED} (hinge)")
-    assert not is_joint_force("Coulomb friction")
+    assert cause_of(f"{LOADED} (hinge)").group == "force"
+    assert cause_of("Coulomb friction").group == "term"
 
 
 @pytest.mark.parametrize(

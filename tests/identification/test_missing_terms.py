@@ -10,16 +10,9 @@ from madoc import robots, simulation
 from madoc.data import Disturbance, disturb, logs, typical_change
 from madoc.identification import missing_terms as terms
 from madoc.identification.candidate_effects import _cut_off
-from madoc.identification.candidate_terms import EARLY, INTEGRATION, LATE_DRIVE, LATE_SENSOR, WHOLE, Candidate, is_late
-from madoc.identification.drifts import (
-    DRIFT,
-    ONE_RUN,
-    WITHIN_RUNS,
-    _between_runs,
-    _drifts,
-    _in_one_run,
-)
-from madoc.identification.joint_forces import LOADED
+from madoc.identification.candidate_terms import WHOLE, Candidate
+from madoc.identification.causes import DRIFT, EARLY, INTEGRATION, LATE_DRIVE, LATE_SENSOR, LOADED, ONE_RUN, WITHIN_RUNS
+from madoc.identification.drifts import _between_runs, _drifts, _in_one_run
 from madoc.identification.score_tests import Products
 from madoc.identification.states import states_of
 from madoc.identification.term_tests import TermTests
@@ -37,7 +30,7 @@ def scores(dataset, simulator, half_width: float = 0.01):
 
 def test_a_sensor_that_reads_late(tmp_path):
     found = scores(*plant(tmp_path, filtered=0.3))
-    late = {term.cause: term for term in found if is_late(term.cause)}
+    late = {term.cause: term for term in found if term.about.group == "late"}
     term = late[f"{LATE_SENSOR} (speed)"]
     assert term.t > 5.0
     assert term.value == pytest.approx(0.3 * 0.02, rel=0.1)

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from madoc.identification.candidate_terms import ON_THE_GROUND, UNLISTED, Candidate
+from madoc.identification.candidate_terms import ON_THE_GROUND, Candidate
+from madoc.identification.causes import UNLISTED
 from madoc.identification.score_tests import Products, Score
 from madoc.identification.term_tests import TermTests, term_of
 from madoc.parameters import Parameter, ParameterSpace

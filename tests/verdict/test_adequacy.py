@@ -8,11 +8,8 @@ from test_judge import PREDICTED
 
 from madoc.calibration.holdout import AgainstChance, Area, OpenLoop, ToldApart
 from madoc.calibration.result import CalibrationResult, ParameterEstimate
-from madoc.identification.body_forces import WEAKENING_ALL
-from madoc.identification.candidate_terms import INTEGRATION, TILTS, UNLISTED
+from madoc.identification.causes import DRIFT, INTEGRATION, TILTS, UNLISTED, WEAKENING, WEAKENING_ALL
 from madoc.identification.combinations import Combination
-from madoc.identification.drifts import DRIFT
-from madoc.identification.joint_forces import WEAKENING
 from madoc.identification.term_tests import Alternative, ImitatedTerm, MissingTerm
 from madoc.verdict import judge
 from madoc.verdict.adequacy import (

@@ -15,7 +15,7 @@ from madoc.calibration import CalibrationProblem, CalibrationResult, LeastSquare
 from madoc.calibration.least_squares import timestep
 from madoc.data.dataset import hold_out
 from madoc.errors import MadocError
-from madoc.identification.candidate_terms import INTEGRATION
+from madoc.identification.causes import INTEGRATION
 from madoc.identification.term_tests import Alternative, Suspicions
 from madoc.verdict import Bench
 from own_robots import SPRING_SPEC, write_robot

@@ -9,7 +9,7 @@ from test_adequacy import held, term
 from madoc.calibration.holdout import RicherModel
 from madoc.data import typical_change
 from madoc.identification import missing_terms
-from madoc.identification.joint_forces import UNEVEN
+from madoc.identification.causes import UNEVEN
 from madoc.identification.states import states_of
 from madoc.identification.term_tests import MissingTerm
 from madoc.verdict.mismatch import _advice

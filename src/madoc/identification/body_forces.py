@@ -9,25 +9,23 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from madoc.identification.causes import (
+    BENT_ALL,
+    CUBIC_ALL,
+    DEAD_ALL,
+    DRAGGED,
+    NEAR_GROUND,
+    OFF_CENTRE,
+    PUSH,
+    SLOWED,
+    WEAKENING_ALL,
+    WIND,
+)
 from madoc.identification.responses import Responses
 from madoc.simulation.attitudes import rotated
 from madoc.simulation.base import Simulator
 from madoc.simulation.write import free_joints
 
-BENT_ALL = "drives that give less, at larger commands, than in proportion to them"
-CUBIC_ALL = "drives that give less at their largest commands, as when they saturate"
-DEAD_ALL = "drives that all give less at small commands, as with a dead zone"
-WEAKENING_ALL = "drives that all weaken with the speed at which they push"
-NEAR_GROUND = "drives that give more near the ground"
-OF_DRIVES = (BENT_ALL, CUBIC_ALL, DEAD_ALL, WEAKENING_ALL, NEAR_GROUND)
-"""Forces of all drives together, in words."""
-WIND = "a constant force from outside, as wind"
-PUSH = "a constant force or torque in the body's own frame"
-SLOWED = "a resistance to the body's motion in proportion to its speed"
-DRAGGED = "a resistance to the body's motion by the square of its speed"
-OFF_CENTRE = "a force or torque in proportion to all that its drives exert, as of thrust off the centre"
-OF_BODIES = (WIND, PUSH, SLOWED, DRAGGED, OFF_CENTRE)
-"""Forces on a free body, in words; its joint's name follows in brackets."""
 SMALL = 0.1
 """Force of a drive relative to its root mean square, beyond which it is out of a dead zone."""
 LOWEST = 0.05

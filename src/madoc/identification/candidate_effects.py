@@ -8,16 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from madoc import simulation
-from madoc.identification.candidate_terms import (
-    DELAY,
-    INTEGRATION,
-    LATE_DRIVE,
-    LATE_SENSOR,
-    SATURATION,
-    SPACING,
-    TILTS,
-    Candidate,
-)
+from madoc.identification.candidate_terms import Candidate
+from madoc.identification.causes import DELAY, INTEGRATION, LATE_DRIVE, LATE_SENSOR, SATURATION, SPACING, TILTS
 from madoc.identification.replay import Readings
 from madoc.parameters import FIELDS, Parameter
 from madoc.simulation.base import Simulator

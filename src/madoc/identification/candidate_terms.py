@@ -21,21 +21,9 @@ from madoc.simulation.joints import deflections, is_drive
 from madoc.simulation.probes import touching_geoms
 from madoc.simulation.write import body_reach, element_names, has_gain, heavy_bodies, linked_bodies, nominal_values
 
-DELAY = "actions that take effect later, by a delay or a lag of the actuator"
-LAG = "commands that drives follow with a lag of first order"
-EARLY = "actions that take effect before they are logged"
-BELOW_MINIMUM = "a value below what is physically possible"
-SATURATION = "a drive that saturates below the limit of its actions"
-SPACING = "another time between rows than the spec says, by another rate or a clock that drifts"
-TILTS = ("a base or a floor that is tilted towards x", "a base or a floor that is tilted towards y")
-INTEGRATION = "the error of the model's integration step"
 WHOLE = 1.5
 """Largest value of the error of the integration step. The value is 1 / (1 - 4^-p) for an integrator of order p, at
 most 4 / 3, as the steps compared with are a quarter as long."""
-LATE_DRIVE = "a drive that acts later than the others"
-LATE_SENSOR = "a sensor that reads late, as behind a filter"
-UNLISTED = "a force that no listed term describes"
-"""What a family of forces stands for, or a listed term of a value that no machine has; more words follow."""
 ON_THE_GROUND = (-9.9, -9.7)
 """m/s², gravity downwards at the poles, at the equator and on mountains."""
 _KNOWN_BEFORE = ("body_mass", "body_com", "body_distance")
@@ -47,11 +35,6 @@ _STILL = 1e-9
 """Standard deviation of a joint's position below which it does not move, so that nothing tells of a spring."""
 _RANGE = 10.0
 """Half of the range in which a term is fitted, in its change or standard error by the score test."""
-
-
-def is_late(cause: str) -> bool:
-    """Whether the cause of a term is that a single drive or sensor is late."""
-    return cause.startswith((LATE_DRIVE, LATE_SENSOR))
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from madoc.identification.candidate_terms import Candidate
+from madoc.identification.causes import DRIFT, ONE_RUN, WITHIN_RUNS
 from madoc.identification.information import NORMAL_95
 from madoc.identification.score_tests import score, shared_deviate, variances_by_group
 from madoc.identification.term_tests import (
@@ -18,10 +19,6 @@ from madoc.identification.term_tests import (
     term_of,
 )
 
-DRIFT = "a value that changes over the log"
-WITHIN_RUNS = "a value that changes within each run"
-ONE_RUN = "another value in one run"
-"""What it stands for; the name of the run follows in brackets."""
 MOST_RUNS = 20
 """Largest number of runs of which each is compared with all others; of more, they are compared all together alone."""
 FEWEST_RUNS = 3
@@ -44,11 +41,6 @@ def drifts_of(tests: TermTests, names: Sequence[str]) -> tuple[list[MissingTerm]
     between, covering = _between_runs(tests)
     others = [*_of_parts(drifts), *covering]
     return list(_most_certain([*drifts, *between, *_in_one_run(tests, names)])), others
-
-
-def is_change(cause: str) -> bool:
-    """Whether the cause of a missing term is that a parameter changes over the log, within runs or in one of them."""
-    return cause in (DRIFT, WITHIN_RUNS) or cause.startswith(ONE_RUN)
 
 
 def _in_one_run(tests: TermTests, names: Sequence[str]) -> Iterator[MissingTerm]:

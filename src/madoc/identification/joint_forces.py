@@ -10,26 +10,27 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from madoc.identification.body_forces import OF_BODIES, OF_DRIVES, free_bodies, of_all_drives, on_body
-from madoc.identification.candidate_terms import UNLISTED, Candidate, references_of
+from madoc.identification.body_forces import free_bodies, of_all_drives, on_body
+from madoc.identification.candidate_terms import Candidate, references_of
+from madoc.identification.causes import (
+    BENT,
+    BUILT_UP,
+    CONSTANT,
+    COUPLED,
+    DEAD_ZONE,
+    FORCES,
+    LOADED,
+    PLACED,
+    RIPPLE,
+    SLOW,
+    UNEVEN,
+    WEAKENING,
+)
 from madoc.identification.responses import Responses
 from madoc.identification.states import LoggedStates
 from madoc.simulation.base import Simulator
 from madoc.simulation.write import single_joints
 
-CONSTANT = "a constant force, as friction that differs by direction"
-LOADED = "friction that grows with the load"
-SLOW = "friction that is larger at low speed"
-WEAKENING = "a drive that weakens with speed"
-DEAD_ZONE = "a drive that gives less at small commands, as with a dead zone"
-BENT = "a drive whose force is not in proportion to its command"
-RIPPLE = "a drive whose gain depends on where the joint is"
-UNEVEN = "friction that depends on where the joint is"
-PLACED = "a force that depends on where the joint is"
-COUPLED = "a force that another joint's motion exerts"
-BUILT_UP = "friction that builds up or falls off over a distance after each reversal, as of belts, seals and brakes"
-FORCES = (CONSTANT, LOADED, SLOW, WEAKENING, DEAD_ZONE, BENT, RIPPLE, UNEVEN, PLACED, COUPLED, BUILT_UP)
-"""What each stands for, in words, the most usual first; the joint's name follows in brackets."""
 RESISTING = (LOADED, SLOW)
 """Those that take energy out, so that no machine has a value below 0."""
 USUAL = 5
@@ -50,11 +51,6 @@ SMALL_COMMAND = 0.1
 """Force of a drive relative to its root mean square, beyond which it is out of a dead zone."""
 _SMALLEST = 1e-9
 """Root mean square of a speed or a force below which a joint or its drive does nothing."""
-
-
-def is_joint_force(cause: str) -> bool:
-    """Whether the cause of a term is a force that no parameter of a spec adds, at a joint or elsewhere."""
-    return cause.startswith((*FORCES, *OF_BODIES, *OF_DRIVES, UNLISTED))
 
 
 def joint_forces(

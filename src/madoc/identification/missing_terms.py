@@ -14,16 +14,8 @@ from jaxtyping import Float
 from madoc import simulation
 from madoc.data.dataset import Dataset
 from madoc.identification.candidate_effects import effects
-from madoc.identification.candidate_terms import (
-    BELOW_MINIMUM,
-    EARLY,
-    INTEGRATION,
-    WHOLE,
-    Candidate,
-    candidates,
-    is_late,
-    of_steps,
-)
+from madoc.identification.candidate_terms import WHOLE, Candidate, candidates, of_steps
+from madoc.identification.causes import BELOW_MINIMUM, EARLY, INTEGRATION, cause_of
 from madoc.identification.drifts import drifts_of
 from madoc.identification.fitted_windows import (
     Fit,
@@ -36,7 +28,7 @@ from madoc.identification.fitted_windows import (
     windows_of,
 )
 from madoc.identification.information import NORMAL_95
-from madoc.identification.joint_forces import force_effects, is_joint_force
+from madoc.identification.joint_forces import force_effects
 from madoc.identification.replay import Readings
 from madoc.identification.responses import Responses, responses_of
 from madoc.identification.score_tests import deviate, imitators, joint_shift, parameter_shift, score
@@ -373,7 +365,7 @@ def _of_forces(tests: TermTests, chosen: list[int]) -> Iterator[Alternative]:
     These are too many for all that cannot be excluded to be covered.
     """
     for index, candidate in enumerate(tests.tried):
-        tried = is_joint_force(candidate.cause) or is_late(candidate.cause)
+        tried = cause_of(candidate.cause).group in ("force", "unlisted", "late")
         found = tests.score(index, chosen) if tried else None
         if found is not None and abs(found.t) >= LIKELY_FORCE:
             yield _with_terms(tests, [index, *chosen])

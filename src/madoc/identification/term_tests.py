@@ -7,7 +7,8 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Int
 
-from madoc.identification.candidate_terms import DELAY, EARLY, INTEGRATION, UNLISTED, Candidate, of_steps
+from madoc.identification.candidate_terms import Candidate, of_steps
+from madoc.identification.causes import DELAY, EARLY, INTEGRATION, UNLISTED, Cause, cause_of
 from madoc.identification.score_tests import Products, Score, imitators, score
 from madoc.parameters import ParameterSpace
 
@@ -52,6 +53,11 @@ class MissingTerm:
     t: float
     shifts: dict[str, float]
     nominal: float = 0.0
+
+    @property
+    def about(self) -> Cause:
+        """What is told and done about its cause."""
+        return cause_of(self.cause)
 
     @property
     def error(self) -> float:

@@ -10,17 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from madoc.identification.body_forces import (
-    BENT_ALL,
-    CUBIC_ALL,
-    DEAD_ALL,
-    NEAR_GROUND,
-    WEAKENING_ALL,
-    FreeBody,
-    free_bodies,
-    of_all_drives,
-)
-from madoc.identification.candidate_terms import UNLISTED
+from madoc.identification.body_forces import FreeBody, free_bodies, of_all_drives
+from madoc.identification.causes import BENT_ALL, CUBIC_ALL, DEAD_ALL, NEAR_GROUND, UNLISTED, WEAKENING_ALL
 from madoc.identification.fitted_windows import Fit, reduced_of
 from madoc.identification.information import NORMAL_95
 from madoc.identification.replay import Readings

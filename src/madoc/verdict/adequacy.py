@@ -8,11 +8,10 @@ from jaxtyping import Float
 
 from madoc.calibration.holdout import HoldOut, Judged, JudgedByErrors
 from madoc.calibration.result import CalibrationResult
-from madoc.identification.candidate_terms import EARLY, INTEGRATION, TILTS, UNLISTED, is_late, of_steps
+from madoc.identification.candidate_terms import of_steps
+from madoc.identification.causes import INTEGRATION
 from madoc.identification.combinations import Combination
-from madoc.identification.drifts import ONE_RUN, WITHIN_RUNS, is_change
 from madoc.identification.information import NORMAL_95
-from madoc.identification.joint_forces import is_joint_force
 from madoc.identification.missing_terms import OTHER_WINDOWS
 from madoc.identification.term_tests import SUSPICIOUS, Alternative, MissingTerm, named
 from madoc.verdict.statistics import beyond_noise
@@ -69,7 +68,7 @@ def of_small_terms(terms: Sequence[MissingTerm]) -> tuple[Alternative, ...]:
 
 
 def _is_small(term: MissingTerm, least: float) -> bool:
-    return term.explained < least and not is_change(term.cause)
+    return term.explained < least and term.about.group != "change"
 
 
 def far_beyond_noise(holdout: Judged) -> bool:
@@ -90,16 +89,11 @@ def likeliest(terms: Sequence[MissingTerm]) -> MissingTerm | None:
     terms = [term for term in terms if not _unlisted(term) or listed < NEARLY * term.explained]
     enough = NEARLY * max((term.explained for term in terms), default=0.0)
     likely = [term for term in terms if term.explained >= enough]
-    return max(likely, key=lambda term: (not _unusual(term), term.explained), default=None)
+    return max(likely, key=lambda term: (not term.about.unusual, term.explained), default=None)
 
 
 def _unlisted(term: MissingTerm) -> bool:
-    return term.cause.startswith(UNLISTED)
-
-
-def _unusual(term: MissingTerm) -> bool:
-    changes = term.cause == WITHIN_RUNS or term.cause.startswith(ONE_RUN)
-    return changes or term.cause in (EARLY, *TILTS) or is_joint_force(term.cause) or is_late(term.cause)
+    return term.about.group == "unlisted"
 
 
 def as_likely(terms: Sequence[MissingTerm], named: MissingTerm) -> list[MissingTerm]:
@@ -109,7 +103,7 @@ def as_likely(terms: Sequence[MissingTerm], named: MissingTerm) -> list[MissingT
         for term in terms
         if (term.cause, term.parameter) != (named.cause, named.parameter)
         and is_certain(term)
-        and not is_change(term.cause)
+        and term.about.group != "change"
         and term.explained >= NEARLY * named.explained
         and (_unlisted(named) or not _unlisted(term))
     ]
@@ -125,7 +119,7 @@ def numerical(terms: Sequence[MissingTerm]) -> MissingTerm | None:
     step = integration(terms)
     if step is None or step.t < CERTAIN or step.explained < NUMERICAL:
         return None
-    others = (each.explained for each in terms if is_certain(each) and not is_change(each.cause))
+    others = (each.explained for each in terms if is_certain(each) and each.about.group != "change")
     return step if max(others, default=0.0) <= step.explained else None
 
 

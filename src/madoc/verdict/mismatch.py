@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 
 from madoc.calibration.holdout import Area, Fitted, HoldOut, PredictionErrors, ToldApart, Verdict
-from madoc.identification.candidate_terms import UNLISTED
-from madoc.identification.drifts import ONE_RUN, WITHIN_RUNS, is_change
+from madoc.identification.causes import ONE_RUN, WITHIN_RUNS
 from madoc.identification.term_tests import MissingTerm, named
 from madoc.verdict.adequacy import CERTAIN, as_likely, far_beyond_noise, integration, missing_term, numerical
-from madoc.verdict.remedies import WARM_UP, addition, is_of_spec, remedy, value_of
+from madoc.verdict.remedies import addition, is_of_spec, remedy, value_of
 from madoc.verdict.statistics import NEGLIGIBLE
 
 _MOST_NAMED = 3
@@ -39,11 +38,11 @@ def _missing(holdout: HoldOut, term: MissingTerm | None) -> Verdict | None:
     if term is None:
         return None
     value = value_of(term)
-    if is_change(term.cause):
+    if term.about.group == "change":
         return Verdict("MODEL_MISMATCH", _changing(holdout, term), (term.parameter,))
     moved = sorted(term.shifts, key=lambda name: -abs(term.shifts[name]))[:2]
     effect = " and ".join(_moved(holdout, term, name) for name in moved)
-    sure = _proved(holdout, term) or term.cause.startswith(UNLISTED)
+    sure = _proved(holdout, term) or term.about.group == "unlisted"
     lacks = "the model lacks" if sure else "what the model lacks acts like"
     return Verdict(
         "MODEL_MISMATCH",
@@ -77,18 +76,15 @@ def _changing(holdout: HoldOut, term: MissingTerm) -> str:
         run = term.cause.removeprefix(f"{ONE_RUN} (").removesuffix(")")
         return (
             f"{term.parameter} is another one in {run}: it differs there by {value} from all other runs {moved}; "
-            "find out what was different in that run, or leave it out"
+            f"{term.about.do}"
         )
     if term.cause == WITHIN_RUNS:
         change = value_of(replace(term, value=2.0 * term.value))
         return (
             f"{term.parameter} drifts: it changes within each run by {change} from the start of a run to its end "
-            f"{moved}; {WARM_UP}"
+            f"{moved}; {term.about.do}"
         )
-    return (
-        f"{term.parameter} drifts: it changes by {value} between parts of the log {moved}; calibrate to each run by "
-        "itself"
-    )
+    return f"{term.parameter} drifts: it changes by {value} between parts of the log {moved}; {term.about.do}"
 
 
 def _proved(holdout: HoldOut, term: MissingTerm) -> bool:

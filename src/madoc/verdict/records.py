@@ -12,7 +12,7 @@ from jaxtyping import Float
 from madoc.calibration.holdout import AgainstChance, Judged, RicherModel
 from madoc.data.findings import Finding
 from madoc.diagnosis.exchanged_columns import exchanged_columns
-from madoc.identification.candidate_terms import INTEGRATION, LAG
+from madoc.identification.causes import INTEGRATION, LAG
 from madoc.identification.excitation import WINDOWS, expected_half_widths
 from madoc.identification.fitted_windows import SHORTER, windows_of
 from madoc.identification.information import OPEN

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from madoc import simulation
 from madoc.calibration.holdout import RicherModel
 from madoc.data import Dataset
-from madoc.identification.candidate_terms import INTEGRATION
+from madoc.identification.causes import INTEGRATION
 from madoc.identification.missing_terms import suspicions
 from madoc.identification.noise import WHITE
 from madoc.identification.states import LoggedStates, states_of
