@@ -42,7 +42,7 @@ def told(result: Result, folder: Path) -> dict:
     assert isinstance(order, CalibrationOrder)
     paths = tuple(str(folder / "cells" / path) for path in order.source.paths)
     prepared = prepare(replace(order, source=replace(order.source, paths=paths)))
-    (method,) = methods_for(order).values()
+    (method,) = methods_for(order.method, order.search.set).values()
     like = method.init(prepared.problem, seed_key(prepared.seed))
     state, _ = checkpoint.load(result.cell.folder(folder) / "checkpoint.npz", like)
     assert prepared.calibrated_truth is not None

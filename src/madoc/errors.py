@@ -2,7 +2,8 @@
 
 import difflib
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 UNPRINTABLE = r"\x00-\x1f\x7f-\x9f\u061c\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ufff9-\ufffb"
 """Characters, as in a class of a regular expression, that move a cursor or turn the direction of text around them."""
@@ -10,11 +11,29 @@ _HIDDEN = re.compile(f"[{UNPRINTABLE}]")
 
 
 class MadocError(ValueError):
-    """Bad input or a refused problem. The command line prints its sentence and exits with code 2."""
+    """Bad input or a refused problem. The command line prints its sentence and exits with code 2.
+
+    Where it is about one option of an order, a suite says the line at which its file has that; "" is a whole part.
+    """
+
+    def __init__(self, sentence: str, *, option: str | None = None) -> None:
+        super().__init__(sentence)
+        self.option = option
 
 
 class NotAllowed(MadocError):
     """What was asked would run code of a user's file, or read files elsewhere, and nobody has allowed that."""
+
+
+@contextmanager
+def about(option: str) -> Iterator[None]:
+    """Say of a refusal inside the block which option it is about, unless it says so itself."""
+    try:
+        yield
+    except MadocError as error:
+        if error.option is None:
+            error.option = option
+        raise
 
 
 def printable(text: str, *, kept: str = "\n\t") -> str:

@@ -63,8 +63,7 @@ def load(
         MadocError: Missing, unreadable, of no supported format, or not data of this task.
     """
     source = Path(path).expanduser()
-    if format is not None and format not in FORMATS:
-        raise unknown_name("format", format, FORMATS)
+    check_format(format)
     if max_transitions is not None and key is None:
         raise MadocError("max_transitions draws episodes at random and needs a key, got none; pass key=")
     name = format or recognise(source)
@@ -77,6 +76,12 @@ def load(
     if max_transitions is None or key is None:
         return dataset
     return subsample(dataset, max_transitions, key)
+
+
+def check_format(name: str | None) -> None:
+    """Refuse a name that is not in `FORMATS`; None stands for any of them."""
+    if name is not None and name not in FORMATS:
+        raise unknown_name("format", name, FORMATS)
 
 
 def recognise(path: Path) -> str:

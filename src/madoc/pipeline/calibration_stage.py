@@ -15,10 +15,10 @@ from madoc.calibration.holdout import Fitted
 from madoc.data import Dataset, observed_task
 from madoc.data.dataset import hold_out
 from madoc.diagnosis import check, refuse_fatal
-from madoc.pipeline.data_stage import Machine, fingerprint, load_source, read_truth
+from madoc.pipeline.data_stage import Machine, fingerprint, load_source
 from madoc.pipeline.methods import choose, hyperparameters, methods_for
 from madoc.pipeline.orders import AUTO, NO_PERMISSION, CalibrationOrder, Permission
-from madoc.pipeline.refusals import check_order, check_search, method_of, seed_key, stage_key
+from madoc.pipeline.refusals import check_calibration, check_folder, seed_key, stage_key, truth_of
 from madoc.report.records import DataRecord, stored_path
 from madoc.runs.budget import Budget, Seconds, read_budget
 from madoc.runs.progress import waiting
@@ -119,27 +119,23 @@ def prepare(order: CalibrationOrder, *, permission: Permission = NO_PERMISSION) 
     Raises:
         MadocError: The robot, the data or the truth is refused, or the check finds the data to be useless.
     """
-    method = method_of(order)
-    budget = None if order.search.budget is None else read_budget(order.search.budget)
-    holdout = HOLDOUT if method == AUTO and order.holdout is None else order.holdout
-    truth = read_truth(order.truth)
     machine, dataset, task = _read(order, permission=permission)
-    truth = dataset.true_parameters if truth is None else truth
-    if truth is not None:
-        machine.check_truth(truth, task)
+    budget = None if order.search.budget is None else read_budget(order.search.budget)
+    holdout = HOLDOUT if order.method == AUTO and order.holdout is None else order.holdout
+    truth = truth_of(order.truth, machine.task, task.parameters.names, known=dataset.true_parameters)
     simulator = simulation.make(task)
     if machine.robot is not None:
         diagnosis = check(dataset, simulator, robot=machine.robot, intervals=False)
         refuse_fatal(diagnosis.findings)
         dataset = replace(dataset, findings=diagnosis.findings)
-    return Prepared(order, method, budget, holdout, machine, dataset, simulator, truth)
+    return Prepared(order, order.method, budget, holdout, machine, dataset, simulator, truth)
 
 
 def _read(order: CalibrationOrder, *, permission: Permission) -> tuple[Machine, Dataset, Task]:
     """The robot, its data, and the task with the parameters and ranges that are calibrated."""
     search = order.search
     machine = Machine.named(order.task, search.physics, permission=permission)
-    check_search(search, machine.task, order.task)
+    check_calibration(order, machine.task)
     dataset = load_source(order.source, machine, seed=search.seed)
     recorded = dataset.physics if dataset.physics != "unknown" else None
     machine = machine.in_physics(search.physics or recorded or "legacy")
@@ -167,9 +163,9 @@ def calibrate_in(
         MadocError: The order cannot be carried out; a new folder is then not left behind.
     """
     out, began = Path(out), time.monotonic()
-    check_order(order, out)
-    methods = methods_for(order)
+    check_folder(out, order.source)
     prepared = prepare(order, permission=permission)
+    methods = methods_for(order.method, order.search.set)
     key = seed_key(prepared.seed)
     name, why = choose(methods, prepared.problem, key)
     prepared, method = prepared.by(name), methods[name]
@@ -207,4 +203,4 @@ def calibrate_in(
 
 def default_folder(order: CalibrationOrder) -> Path:
     """The run folder of an order that names none: `runs/TASK-METHOD-SEED`."""
-    return Path("runs") / f"{Path(order.task).stem}-{method_of(order)}-{order.search.seed}"
+    return Path("runs") / f"{Path(order.task).stem}-{order.method}-{order.search.seed}"

@@ -15,7 +15,7 @@ from madoc.parameters import ParameterSpace
 from madoc.pipeline.calibration_stage import prepare
 from madoc.pipeline.methods import methods_for
 from madoc.pipeline.orders import NO_PERMISSION, CalibrationOrder, CheckOrder, Permission, SelftestOrder
-from madoc.pipeline.refusals import check_order, check_seed, stage_key
+from madoc.pipeline.refusals import check_counts, check_seed, stage_key
 from madoc.report.words import duration
 from madoc.runs.budget import read_budget
 from madoc.verdict.predicted import sensor_noise
@@ -104,11 +104,9 @@ def selftest_of(order: SelftestOrder, *, quiet: bool = False, permission: Permis
         MadocError: The order cannot be carried out, or every method refuses.
     """
     calibration = CalibrationOrder(order.task, order.source, order.search)
-    check_order(calibration)
-    if order.truths < 1:
-        raise MadocError(f"expected at least 1 truth to plant, got {order.truths}")
+    check_counts(truth=order.truths)
     prepared = prepare(calibration, permission=permission)
-    methods = list(methods_for(calibration).values())
+    methods = list(methods_for(calibration.method, calibration.search.set).values())
     key = stage_key(order.search.seed, "selftest")
     return selftest(
         methods,

@@ -9,15 +9,14 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from madoc import data, robots, simulation, tasks
-from madoc.data import Dataset, logs
+from madoc.data import Dataset, Disturbance, logs
 from madoc.data.native import recognises as is_recorded
-from madoc.errors import MadocError, unknown_name
+from madoc.errors import MadocError, about, unknown_name
 from madoc.pipeline.orders import NO_PERMISSION, Permission, RecordOrder, Source
-from madoc.pipeline.refusals import stage_key
+from madoc.pipeline.refusals import check_counts, check_seed, stage_key
 from madoc.policies.behaviours import QUALITIES, record_quality
 from madoc.report.records import SpecRecord
 from madoc.robots import Robot
-from madoc.runs.files import read_json
 from madoc.runs.progress import bar
 from madoc.simulation import Simulator
 from madoc.tasks import TASKS, Task
@@ -66,20 +65,6 @@ class Machine:
         )
         return simulator, simulator.parameters.vector(truth)
 
-    def check_truth(self, truth: Mapping[str, float], calibrated: Task) -> None:
-        """Refuse a truth that lacks a calibrated parameter, or names one that the robot does not have.
-
-        Raises:
-            MadocError: Names the parameter.
-        """
-        known = self.task.parameters.names
-        for name in truth:
-            if name not in known:
-                raise unknown_name(f"parameter of {self.task.name} in the truth", name, known)
-        missing = [name for name in calibrated.parameters.names if name not in truth]
-        if missing:
-            raise MadocError(f"the truth has no value for {missing[0]}; add it, or do not calibrate that")
-
     def stored(self) -> dict[str, object]:
         """The entry of a user's own robot in `spec.json`, from which it is restored; nothing for one of Madoc's."""
         return {} if self.task.source is None else {"robot": dict(self.task.source)}
@@ -109,26 +94,38 @@ def record(simulator: Simulator, quality: str, *, transitions: int, key: PRNGKey
     Raises:
         MadocError: The quality is unknown, no behaviour policies are shipped for the robot, or no row is wanted.
     """
-    if transitions < 1:
-        raise MadocError(f"expected at least 1 transition to record, got {transitions}")
+    check_counts(transition=transitions)
     name = f"{simulator.task.name}-{quality}"
     with bar(f"recording {name}", total=transitions, unit="transitions", quiet=quiet) as advance:
         return record_quality(simulator, quality, transitions=transitions, key=key, advance=advance)
+
+
+def check_recording(order: RecordOrder) -> tuple[str, str, Disturbance]:
+    """The task of a recording, its quality, and all that is disturbed in it.
+
+    Raises:
+        MadocError: The name is no TASK-QUALITY, no row is wanted, or the seed or the friction is impossible.
+    """
+    with about("name"):
+        task, quality = split_name(order.name)
+        if not quality:
+            raise MadocError(
+                f"expected TASK-QUALITY, got {order.name!r}; for example {task}-medium, of: {', '.join(QUALITIES)}"
+            )
+    check_counts(transition=order.transitions)
+    check_seed(order.seed)
+    with about("friction"):
+        return task, quality, replace(order.disturbance, friction=order.friction)
 
 
 def record_named(order: RecordOrder, *, quiet: bool = False) -> Dataset:
     """Record `TASK-QUALITY` in the target with the paper's truth, its contacts and sensors disturbed if asked.
 
     Raises:
-        MadocError: The name is no TASK-QUALITY, or `record` refuses.
+        MadocError: `check_recording` or `record` refuses.
     """
-    task_name, quality = split_name(order.name)
-    if not quality:
-        raise MadocError(
-            f"expected TASK-QUALITY, got {order.name!r}; for example {task_name}-medium, of: {', '.join(QUALITIES)}"
-        )
+    task_name, quality, asked = check_recording(order)
     key = stage_key(order.seed, "recording")
-    asked = replace(order.disturbance, friction=order.friction)
     task = tasks.make(task_name, order.physics)
     simulator = simulation.make(task if asked.friction == 1.0 else task.with_friction(asked.friction))
     dataset = record(simulator, quality, transitions=order.transitions, key=key, quiet=quiet)
@@ -172,20 +169,3 @@ def fingerprint(dataset: Dataset) -> str:
     for column in (logged.observation, logged.action, logged.next_observation, logged.terminated):
         total = zlib.crc32(np.ascontiguousarray(column).tobytes(), total)
     return f"{total:08x}"
-
-
-def read_truth(path: Path | None) -> dict[str, float] | None:
-    """True parameters from a JSON file `{name: value}`; None without a file.
-
-    Raises:
-        MadocError: The file is missing or no JSON, or holds anything but finite numbers by name.
-    """
-    if path is None:
-        return None
-    values = read_json(path)
-    if not isinstance(values, dict) or not values:
-        raise MadocError(f'expected {{"parameter": value, ...}} in {path}, got {type(values).__name__}')
-    for name, value in values.items():
-        if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-            raise MadocError(f"expected a finite number for {name} in {path}, got {value!r}")
-    return {name: float(value) for name, value in values.items()}

@@ -10,10 +10,10 @@ from madoc import simulation
 from madoc.errors import MadocError
 from madoc.evaluation import evaluate
 from madoc.pipeline.calibrated import Calibrated, read_calibration
-from madoc.pipeline.data_stage import Machine, read_truth
+from madoc.pipeline.data_stage import Machine
 from madoc.pipeline.film_stage import leave_film
 from madoc.pipeline.orders import NO_PERMISSION, EvaluationOrder, Permission
-from madoc.pipeline.refusals import check_counts, stage_key
+from madoc.pipeline.refusals import check_counts, stage_key, truth_of
 from madoc.policies import ErrorCost, OverDraws, costs_of_errors, load_policy, over_draws
 from madoc.report.records import EvaluationRecord, SpecRecord, read_spec
 from madoc.runs.files import write_json
@@ -50,18 +50,16 @@ def evaluate_folder(
     found = find_policies(folder)
     policies = {name: load_policy(found[name]) for name in names or found}
     spec = _spec_with_truth(folder, found)
-    truth = read_truth(order.truth) or spec.truth
+    machine = Machine.restored(spec, permission=permission)
+    truth = truth_of(order.truth, machine.task, spec.parameters, known=spec.truth)
     calibrated = _calibration_of(calibration or folder, permission=permission)
     if truth is None and calibrated is None:
         raise MadocError(
             f"the true parameters of {folder} are not known, and it holds no calibration to evaluate at; "
             "pass --truth FILE.json, or name the run folder"
         )
-    target, estimated = None, None
-    if truth is not None:
-        machine = Machine.restored(spec, permission=permission)
-        machine.check_truth(truth, machine.task.with_parameters(list(spec.parameters)))
-        target = machine.at(truth)
+    target = None if truth is None else machine.at(truth)
+    estimated = None
     if calibrated is not None:
         estimated = simulation.make(calibrated.task.for_policies), calibrated.result.mean
     in_target, at_estimate = (
@@ -71,11 +69,10 @@ def evaluate_folder(
     system = target or estimated
     assert system is not None  # one of them is known
     leave_film(out or folder, policies, *system, key)
-    task = Machine.restored(spec, permission=permission).task
     yardsticks = [name for name in policies if read_spec(found[name].parent).at in YARDSTICKS]
     evaluation = EvaluationRecord(
-        task.name,
-        task.physics,
+        machine.task.name,
+        machine.task.physics,
         order.episodes,
         order.seed,
         in_target,

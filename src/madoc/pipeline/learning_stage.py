@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import get_args
+from typing import Any
 
 import numpy as np
 
@@ -13,9 +13,9 @@ from madoc.errors import MadocError, unknown_name
 from madoc.parameters import ParameterDistribution
 from madoc.pipeline import refusals
 from madoc.pipeline.calibrated import Calibrated
-from madoc.pipeline.data_stage import fingerprint, load_source, read_truth
+from madoc.pipeline.data_stage import fingerprint, load_source
 from madoc.pipeline.methods import hyperparameters, learner_of
-from madoc.pipeline.orders import DEFAULT_LEARNER, Place, PolicyOrder
+from madoc.pipeline.orders import DEFAULT_LEARNER, PolicyOrder
 from madoc.policies import (
     LEARNERS,
     LearnedPolicy,
@@ -23,13 +23,11 @@ from madoc.policies import (
     PolicyProblem,
     UniformParameters,
     learn_policy,
-    require_reward,
 )
+from madoc.runs.budget import read_budget
 from madoc.runs.run_folder import working_folder
 from madoc.simulation import Simulator
-
-PLACES: tuple[str, ...] = get_args(Place)
-"""Where a policy may be learnt, as `PolicyOrder.at` explains."""
+from madoc.types import MethodEntry
 
 
 def learn_in(
@@ -42,15 +40,14 @@ def learn_in(
     Raises:
         MadocError: The order cannot be carried out; a new folder is then not left behind.
     """
+    refusals.check_policy(order, calibrated.task)
     method, entry = learner_of(order.method, order.set)
-    budget = refusals.policy_budget(entry.name, order.budget)
-    refusals.check_place(entry.name, order.at, f"--at {order.at}")
-    require_reward(calibrated.task)
-    refusals.require_no_goals(calibrated.task, entry.name)
+    budget = read_budget(entry.usual_budget if order.budget is None else order.budget, entry.unit)
     key = refusals.stage_key(order.seed, "learning")
-    truth = read_truth(order.truth) or calibrated.spec.truth
+    names = calibrated.task.parameters.names
+    truth = refusals.truth_of(order.truth, calibrated.machine.task, names, known=calibrated.spec.truth)
     simulator, parameters = _system(calibrated, order, truth)
-    dataset = _logged(calibrated, entry.name) if entry.needs_data else None
+    dataset = _logged(calibrated, entry) if entry.needs_data else None
     spec = {
         "command": "learn",
         "task": calibrated.task.name,
@@ -78,15 +75,15 @@ def policy_folder_name(at: str, method: str) -> str:
     return f"policy-{at}" if method == DEFAULT_LEARNER else f"policy-{at}-{method}"
 
 
-def _logged(calibrated: Calibrated, method: str) -> Dataset:
+def _logged(calibrated: Calibrated, learner: MethodEntry[Any]) -> Dataset:
     """The data of a calibration, for a learner that learns from it."""
     if calibrated.source is None:
         raise MadocError(
-            f"{method} learns from logged data, and a bare result names no data; "
+            f"{learner.name} learns from logged data, and a bare result names no data; "
             "give it the run folder of the calibration"
         )
     dataset = load_source(calibrated.source, calibrated.machine, seed=calibrated.result.seed)
-    refusals.require_velocities(method, dataset.disturbance, dataset.origin)
+    refusals.require_velocities(learner, dataset.disturbance, dataset.origin)
     recorded = "" if calibrated.spec.data is None else calibrated.spec.data.fingerprint
     if recorded and fingerprint(dataset) != recorded:
         raise MadocError(
@@ -101,11 +98,6 @@ def _system(
 ) -> tuple[Simulator, np.ndarray | ParameterDistribution]:
     """The simulator to learn in, and its physical values, or the distribution to draw them from."""
     at = order.at
-    if at not in PLACES:
-        raise unknown_name("place to learn at", at, PLACES)
-    refusals.check_drawing(order.drawing, at, "--share and --width are of --at distribution")
-    if truth is not None:
-        calibrated.machine.check_truth(truth, calibrated.task)
     if at == "truth":
         if truth is None:
             raise MadocError("the true parameters are not known here; pass --truth FILE.json")

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, fields, is_dataclass, replace
-from functools import partial
+from functools import cache, partial
 from typing import Any, TypeVar, get_type_hints
 
 from jaxtyping import PRNGKeyArray
@@ -11,8 +11,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from madoc.calibration import CALIBRATORS, CalibrationProblem, Calibrator
 from madoc.errors import MadocError, unknown_name
-from madoc.pipeline.orders import AUTO, CalibrationOrder, Settings, parse_settings
-from madoc.pipeline.refusals import method_of
+from madoc.pipeline.orders import AUTO, Settings, parse_settings
 from madoc.policies import LEARNERS, PolicyLearner
 from madoc.types import MethodEntry, entry_of
 
@@ -47,6 +46,7 @@ def make_method(
     return make(**new)
 
 
+@cache  # cells of a suite mostly differ in other things
 def learner_of(name: str, settings: Settings) -> tuple[PolicyLearner[Any], MethodEntry[Any]]:
     """A policy learner with its settings, and the entry of what it then is: `sac` that is told to randomize is `dr`."""
     learner = make_method(LEARNERS, name, parse_settings(settings))
@@ -69,16 +69,15 @@ def candidates_for(changes: Mapping[str, object]) -> dict[str, Calibrator[Any]]:
     return {name: make_method(CALIBRATORS, name, changed[name]) for name in CANDIDATES}
 
 
-def methods_for(order: CalibrationOrder) -> dict[str, Calibrator[Any]]:
-    """The methods of an order by name: one, or those that `auto` may take.
+@cache
+def methods_for(name: str, settings: Settings) -> Mapping[str, Calibrator[Any]]:
+    """The calibrators that a name stands for: one, or those that `auto` may take.
 
     Raises:
         MadocError: As `make_method` or `candidates_for`.
     """
-    name = method_of(order)
-    if name == AUTO:
-        return candidates_for(order.search.changes)
-    return {name: make_method(CALIBRATORS, name, order.search.changes)}
+    changes = parse_settings(settings)
+    return candidates_for(changes) if name == AUTO else {name: make_method(CALIBRATORS, name, changes)}
 
 
 def choose(

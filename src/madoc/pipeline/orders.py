@@ -97,11 +97,6 @@ class Search:
     seed: int = 0
     """Seed of all random numbers."""
 
-    @property
-    def changes(self) -> dict[str, str]:
-        """Hyperparameters that differ from the method's defaults, as `parse_settings` reads them."""
-        return parse_settings(self.set)
-
 
 @dataclass(frozen=True)
 class CalibrationOrder:
@@ -115,6 +110,11 @@ class CalibrationOrder:
     """Share of the rows that no method sees, to judge the result by. Default: 0.2 for auto, else none."""
     truth: Path | None = None
     """JSON file {parameter: value} to judge the result by; no method ever sees it."""
+
+    @property
+    def method(self) -> str:
+        """Name of the calibrator, `auto` by default."""
+        return self.search.method or AUTO
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from madoc.errors import MadocError
 from madoc.pipeline import refusals
 from madoc.pipeline.calibrated import Calibrated, calibration_ended, read_calibration
 from madoc.pipeline.calibration_stage import calibrate_in
-from madoc.pipeline.data_stage import Machine, load_source, read_truth, record_named, split_name
+from madoc.pipeline.data_stage import Machine, load_source, record_named, split_name
 from madoc.pipeline.evaluation_stage import evaluate_folder
 from madoc.pipeline.export_stage import export_run
 from madoc.pipeline.learning_stage import learn_in
@@ -26,7 +26,6 @@ from madoc.pipeline.orders import (
     RunOrder,
     Source,
 )
-from madoc.policies import require_reward
 from madoc.report.records import Summary, read_object, read_record
 from madoc.robots import is_spec_path
 from madoc.runs.files import read_json
@@ -90,9 +89,16 @@ def _calibration_order(order: RunOrder, source: Source) -> CalibrationOrder:
     return CalibrationOrder(task, source, order.search, holdout=order.holdout, truth=order.truth)
 
 
+def _policy_order(order: RunOrder) -> PolicyOrder:
+    """The policy that a run asks for, yardsticks aside."""
+    return PolicyOrder(
+        order.learner, order.policy_at, order.drawing, order.policy_set, order.policy_budget, order.search.seed
+    )
+
+
 def _spec(order: RunOrder, machine: Machine, out: Path) -> dict[str, object]:
     """The order as JSON for `spec.json`; it is refused here already if a later stage would refuse it."""
-    require_reward(machine.task)
+    refusals.check_policy(_policy_order(order), machine.task, written="--policy-{}")
     if not order.data and not split_name(order.name)[1]:
         own = is_spec_path(order.name)
         raise MadocError(
@@ -101,25 +107,16 @@ def _spec(order: RunOrder, machine: Machine, out: Path) -> dict[str, object]:
             else f"expected TASK-QUALITY to record, as {order.name}-medium, or --data FILE to load"
         )
     refusals.check_counts(transition=order.transitions, episode=order.episodes, draw=order.draws)
-    asked = _calibration_order(order, Source(order.data or (order.name,)))
-    refusals.check_order(asked, out)
-    refusals.check_search(order.search, machine.task, order.name)
-    truth = read_truth(order.truth)
-    if truth is not None:
-        calibrated = order.search.parameters or machine.task.parameters.names
-        machine.check_truth(truth, machine.task.with_parameters(list(calibrated)))
-    refusals.check_drawing(
-        order.drawing, order.policy_at, "--policy-share and --policy-width are of --policy-at distribution"
-    )
+    asked = _calibration_order(order, Source(order.data or (order.name,), order.transitions, order.reading))
+    refusals.check_folder(out, asked.source)
+    refusals.check_calibration(asked, machine.task)
+    methods = methods_for(asked.method, order.search.set)
     learner, entry = learner_of(order.learner, order.policy_set)
-    refusals.check_place(entry.name, order.policy_at, f"--policy-at {order.policy_at}")
-    refusals.require_no_goals(machine.task, entry.name)
-    refusals.require_velocities(entry.name, order.reading.disturbance, f"the data of {order.name}")
-    refusals.policy_budget(entry.name, order.policy_budget)
+    refusals.require_velocities(entry, order.reading.disturbance, f"the data of {order.name}")
     resolved = {
         "command": "run",
-        "truth": truth,
-        "hyperparameters": {name: hyperparameters(method) for name, method in methods_for(asked).items()},
+        "truth": refusals.truth_of(order.truth, machine.task, order.search.parameters),
+        "hyperparameters": {name: hyperparameters(method) for name, method in methods.items()},
         "policy_hyperparameters": hyperparameters(learner),
     }
     plain = replace(order, search=replace(order.search, set=()), policy_set=())
@@ -149,8 +146,9 @@ def _calibrate(order: RunOrder, out: Path, *, quiet: bool, permission: Permissio
 def _learn(order: RunOrder, calibrated: Calibrated, at: Place, folder: Path, *, quiet: bool) -> dict[str, object]:
     """Leave the folder of one policy; returns how its learning ended."""
     if not ended(folder, "policy.npz"):
-        drawing = order.drawing if at == "distribution" else Drawing()
-        asked = PolicyOrder(order.learner, at, drawing, order.policy_set, order.policy_budget, order.search.seed)
+        asked = _policy_order(order)
+        if at != order.policy_at:
+            asked = replace(asked, at=at, drawing=Drawing())
         learn_in(folder, calibrated, asked, resume=holds_run(folder), quiet=quiet)
     return read_object(folder / "result.json")
 

@@ -44,14 +44,6 @@ _LISTS = {"data": "a path or a list of paths", "parameters": "a name or a list o
 """Keys whose value is a list, or a single text for a list of one, and that in words."""
 
 
-class Misfit(MadocError):
-    """A value that an order refuses, and the key that it stands under."""
-
-    def __init__(self, key: str, sentence: str) -> None:
-        super().__init__(sentence)
-        self.key = key
-
-
 @functools.cache
 def keys_of(order: Any) -> Mapping[str, Place]:
     """Every key of an order, and where its value is in it; the keys of its parts stand beside its own."""
@@ -78,14 +70,14 @@ def build(order: type[Asked], given: Mapping[str, object]) -> Asked:
     """An order from the keys of a suite file; no value is converted into another type.
 
     Raises:
-        Misfit: A key is unknown or missing, or a value is refused.
+        MadocError: A key is unknown or missing, or a value is refused; it names the key.
     """
     kind: Any = order  # mypy does not see that a dataclass itself can be hashed
     keys = keys_of(kind)
     nested: dict[str, Any] = {}
     for key, value in given.items():
         if key not in keys:
-            raise Misfit(key, f"unknown key {key!r}; {nearest_hint(key, keys)}")
+            raise MadocError(f"unknown key {key!r}; {nearest_hint(key, keys)}", option=key)
         *parts, last = keys[key]
         place = nested
         for part in parts:
@@ -96,7 +88,8 @@ def build(order: type[Asked], given: Mapping[str, object]) -> Asked:
     except ValidationError as error:
         detail = error.errors()[0]
         key = _key_at(keys, tuple(part for part in detail["loc"] if isinstance(part, str)))
-        raise Misfit(key, mistake(detail, (key,), list(keys)) + _grid_hint(key, given.get(key))) from error
+        sentence = mistake(detail, (key,), list(keys)) + _grid_hint(key, given.get(key))
+        raise MadocError(sentence, option=key) from error
 
 
 @functools.cache
@@ -121,7 +114,7 @@ def _listed(key: str, value: object) -> object:
     if key not in _LISTS or isinstance(value, list):
         return value
     if not isinstance(value, str):
-        raise Misfit(key, f"expected {_LISTS[key]} in {key}, got {shown(value)}")
+        raise MadocError(f"expected {_LISTS[key]} in {key}, got {shown(value)}", option=key)
     return [value]
 
 
@@ -134,7 +127,8 @@ def _grid_hint(key: str, value: object) -> str:
 def _settings(value: object) -> list[list[str]]:
     """Hyperparameters as the command line has them: `{hidden: [16, 16]}` is `hidden=[16, 16]`."""
     if not isinstance(value, Mapping):
-        raise Misfit(_SETTINGS, f"expected keys and values in set, as {{updates: 2}}, got {value!r:.60}")
+        sentence = f"expected keys and values in set, as {{updates: 2}}, got {value!r:.60}"
+        raise MadocError(sentence, option=_SETTINGS)
     texts = {name: part if isinstance(part, str) else json.dumps(part) for name, part in value.items()}
     return [[f"{name}={text}" for name, text in texts.items()]]
 

@@ -7,11 +7,12 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from madoc.errors import nearest_hint
+from madoc.errors import MadocError, nearest_hint
+from madoc.pipeline.data_stage import check_recording
 from madoc.pipeline.orders import NO_PERMISSION, CalibrationOrder, EvaluationOrder, Permission, PolicyOrder, RecordOrder
 from madoc.robots.document import Document
 from madoc.suites import checks
-from madoc.suites.cells import RECORDED, Asked, Cell, Kind, Misfit, Order, build, keys_of, stored
+from madoc.suites.cells import RECORDED, Asked, Cell, Kind, Order, build, keys_of, stored
 from madoc.suites.grid import GRID, ROBOTS, Combination, combinations, read_suite
 from madoc.tasks import TASKS
 
@@ -57,8 +58,10 @@ class _Planner:
             last = self._calibration(given, parts.pop("record", None), asked)
             if parts:
                 last = self._policy(parts, last, asked)
-        except Misfit as error:
-            place = asked.places.get(error.key, asked.places[""])
+        except MadocError as error:
+            if error.option is None:
+                raise
+            place = asked.places.get(error.option, asked.places[""])
             raise self.document.error(place, str(error)) from error
         self._want(last, asked)
 
@@ -78,18 +81,19 @@ class _Planner:
         needs = None
         if record is not None:
             if "data" in given:
-                raise Misfit("record", "record: and data: both name the data; keep one")
+                raise MadocError("record: and data: both name the data; keep one", option="record")
             recording = self._part(RecordOrder, "record", record, asked)
             with self._inside("record", asked):
-                checks.check_recording(recording)
+                check_recording(recording)
             needs = self._put("record", recording, None, asked).name
             robot = recording.name.partition("-")[0]
             if given.get("task", robot) != robot:
-                raise Misfit("record", f"{recording.name} is a recording of {robot}, and task: another; leave it out")
+                sentence = f"{recording.name} is a recording of {robot}, and task: another; leave it out"
+                raise MadocError(sentence, option="record")
             given |= {"data": [f"{needs}/{RECORDED}"], "task": robot}
         known = [*keys_of(CalibrationOrder), *PARTS, ROBOTS, GRID]
         if unknown := next((key for key in given if key not in known), None):
-            raise Misfit(unknown, f"unknown key {unknown!r}; {nearest_hint(unknown, known)}")
+            raise MadocError(f"unknown key {unknown!r}; {nearest_hint(unknown, known)}", option=unknown)
         order = build(CalibrationOrder, self._located(given, recorded=needs is not None))
         checks.check_calibration(order, recorded=needs is not None, permission=self.permission)
         return self._put("calibrate", order, needs, asked)
@@ -97,7 +101,8 @@ class _Planner:
     def _policy(self, parts: Mapping[str, object], calibration: Cell, asked: Combination) -> Cell:
         """The policy of a combination, and its evaluation if that is asked for too."""
         if "learn" not in parts:
-            raise Misfit("evaluate", "evaluate: belongs to learn:, and there is no policy to evaluate; add one")
+            sentence = "evaluate: belongs to learn:, and there is no policy to evaluate; add one"
+            raise MadocError(sentence, option="evaluate")
         calibrating = calibration.read()
         assert isinstance(calibrating, CalibrationOrder)
         seed = calibrating.search.seed
@@ -131,8 +136,8 @@ class _Planner:
         """Give refusals in the block the line of their key inside a part of the entry, as `learn:`."""
         try:
             yield
-        except Misfit as error:
-            raise self.document.error((*asked.places[name], error.key), str(error)) from error
+        except MadocError as error:
+            raise self.document.error((*asked.places[name], error.option or ""), str(error)) from error
 
     def _located(self, given: Mapping[str, Any], *, recorded: bool = False) -> dict[str, Any]:
         """Values with the paths among them made absolute: they are relative to the suite file."""
