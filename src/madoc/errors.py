@@ -36,6 +36,15 @@ def about(option: str) -> Iterator[None]:
         raise
 
 
+@contextmanager
+def needing(what: str, package: str) -> Iterator[None]:
+    """Refuse where an import in the block fails: the sentence is `what` needs the package, and how it is installed."""
+    try:
+        yield
+    except ImportError as error:
+        raise MadocError(f'{what} pip install "{package}" ({error})') from error
+
+
 def printable(text: str, *, kept: str = "\n\t") -> str:
     """A text whose control characters and those that turn its direction are written as numbers, but for some."""
     return _HIDDEN.sub(lambda found: found[0] if found[0] in kept else f"\\u{ord(found[0]):04x}", text)

@@ -11,7 +11,7 @@ from rich.table import Table
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from madoc.commands.answer import Answer, Output
-from madoc.errors import MadocError, listed, nearest
+from madoc.errors import MadocError, listed, nearest, needing
 from madoc.pipeline.orders import Permission
 
 if TYPE_CHECKING:
@@ -207,11 +207,8 @@ def model_of(name: str, *, menagerie: Path | None = None, download: bool = False
 
 def _fetched(name: str) -> Path:
     """The model that robot_descriptions fetches by git, MJCF before URDF."""
-    try:
+    with needing("fetching a robot needs the package robot_descriptions;", "madoc-calibration[robots]"):
         known = importlib.import_module("robot_descriptions._descriptions").DESCRIPTIONS
-    except ImportError:
-        needed = 'pip install "madoc-calibration[robots]"'
-        raise MadocError(f"fetching a robot needs the package robot_descriptions; {needed}") from None
     for kind, path in (("mj_description", "MJCF_PATH"), ("description", "URDF_PATH")):
         if f"{name}_{kind}" in known:
             try:

@@ -14,7 +14,7 @@ import numpy as np
 from madoc.data.archives import opened, size_of
 from madoc.data.dataset import Dataset, close_episodes, join
 from madoc.data.validation import LARGEST_DATASET, as_matrix, as_transitions, check_size, validate
-from madoc.errors import MadocError
+from madoc.errors import MadocError, needing
 from madoc.tasks import Task
 from madoc.types import Transitions
 
@@ -120,10 +120,8 @@ def read_episodes(directory: Path) -> tuple[list["EpisodeData"], str]:
 
 
 def _import_minari() -> ModuleType:
-    try:
+    with needing("Minari datasets need the library:", "minari[hdf5]"):
         import minari
-    except ImportError as error:
-        raise MadocError(f'Minari datasets need the library: pip install "minari[hdf5]" ({error})') from error
     return minari
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
-from madoc.errors import MadocError
+from madoc.errors import needing
 from madoc.numpy_policy import NumpyPolicy
 from madoc.runs.files import replacing
 
@@ -23,10 +23,8 @@ def save_onnx(policy: NumpyPolicy, path: Path) -> None:
     Raises:
         MadocError: The package onnx is not installed, or the file cannot be written.
     """
-    try:
+    with needing("ONNX files need the package onnx;", "madoc-calibration[onnx]"):
         import onnx
-    except ImportError:
-        raise MadocError('ONNX files need the package onnx; pip install "madoc-calibration[onnx]"') from None
     model = _model(policy, onnx)
     onnx.checker.check_model(model, full_check=True)
     with replacing(path) as stream:

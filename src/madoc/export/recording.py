@@ -9,7 +9,7 @@ from urllib.parse import quote
 import numpy as np
 from jaxtyping import Float
 
-from madoc.errors import MadocError
+from madoc.errors import MadocError, needing
 from madoc.simulation import Simulator
 from madoc.simulation.pictures import Solid, placed, solids
 
@@ -88,13 +88,9 @@ def _rerun(evidence: Mapping[str, np.ndarray]) -> ModuleType:
         raise MadocError(
             "no held-out run has positions to show; calibrate with --holdout to logs that show the joints' positions"
         )
-    try:
+    with needing("a view of the robot needs the package rerun-sdk;", "madoc-calibration[view]"):
         import rerun
         import rerun.blueprint
-    except ImportError:
-        raise MadocError(
-            'a view of the robot needs the package rerun-sdk; pip install "madoc-calibration[view]"'
-        ) from None
     return rerun
 
 

@@ -20,7 +20,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from madoc.errors import MadocError
+from madoc.errors import MadocError, needing
 from madoc.pipeline.orders import NO_PERMISSION, Permission
 from madoc.runs.machine import prepare_worker, usable_cores
 from madoc.runs.progress import display, interruptible
@@ -249,7 +249,8 @@ def _cluster(workers: int | None, address: str | None) -> Iterator["ModuleType"]
     if address is None:
         os.environ.update(own)
     try:
-        ray = _imported()
+        with needing("--executor ray needs ray:", "madoc-calibration[ray]"):
+            import ray
         common: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR, "configure_logging": False}
         if address is None:
             common |= {
@@ -288,12 +289,3 @@ def _look_for(address: str) -> None:
         except OSError as error:
             reason = error.strerror or str(error)
             raise MadocError(f"there is no Ray cluster at {address}: {reason}; start one with: ray start") from error
-
-
-def _imported() -> "ModuleType":
-    """The package ray."""
-    try:
-        import ray
-    except ImportError as error:
-        raise MadocError(f'--executor ray needs ray: pip install "madoc-calibration[ray]" ({error})') from error
-    return ray

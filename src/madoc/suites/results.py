@@ -16,7 +16,7 @@ import numpy as np
 
 from madoc.calibration.holdout import Verdict
 from madoc.calibration.result import CalibrationResult, ParameterEstimate
-from madoc.errors import MadocError, printable
+from madoc.errors import needing, printable
 from madoc.identification.information import NORMAL_95
 from madoc.identification.random_effects import Common, common, outliers
 from madoc.report.records import EvaluationRecord, read_object, read_record
@@ -131,11 +131,9 @@ def write_parquet(file: Path, table: Sequence[dict[str, Any]]) -> None:
     Raises:
         MadocError: pyarrow is not installed.
     """
-    try:
+    with needing("--parquet needs pyarrow:", "madoc-calibration[logs]"):
         import pyarrow
         import pyarrow.parquet
-    except ImportError as error:
-        raise MadocError(f'--parquet needs pyarrow: pip install "madoc-calibration[logs]" ({error})') from error
     types = {str: pyarrow.string(), int: pyarrow.int64(), float: pyarrow.float64()}
     schema = pyarrow.schema([(name, types[kind]) for name, kind in COLUMNS.items()])
     columns = [{name: row.get(name) for name in COLUMNS} for row in table]

@@ -13,7 +13,7 @@ import numpy as np
 
 from madoc.data.logs.tables import WIDEST, Run, Table
 from madoc.data.validation import LARGEST, check_size
-from madoc.errors import MadocError
+from madoc.errors import MadocError, needing
 
 if TYPE_CHECKING:
     from mcap.records import Chunk
@@ -23,7 +23,7 @@ MOST_NAMES = 10_000
 """Number of columns of a topic that are known by name, beside those that are asked for."""
 _OF_TIMES = 200
 """Size of the three times of a message, bytes in memory."""
-EXTRA = 'pip install "madoc-calibration[logs]"'
+EXTRA = "madoc-calibration[logs]"
 
 Decoder = Callable[[bytes], object]
 
@@ -145,10 +145,8 @@ def _decoder(topic: str, kind: Kind) -> Decoder | None:
         return json.loads
     if kind.encoding != "cdr":
         return None
-    try:
+    with needing(f"topic {topic} holds ROS 2 messages, which need:", EXTRA):
         from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
-    except ImportError as error:
-        raise MadocError(f"topic {topic} holds ROS 2 messages, which need: {EXTRA} ({error})") from error
     store = get_typestore(Stores.LATEST)  # has the types of bags from before ROS 2 Iron, which hold no definitions
     name = kind.name if kind.name.count("/") > 1 else kind.name.replace("/", "/msg/")
     try:
@@ -226,10 +224,8 @@ def read_mcap(path: Path, wanted: Collection[str]) -> list[Run]:
 
 
 def _messages_of_mcap(path: Path) -> Iterator[Message]:
-    try:
+    with needing("MCAP logs need the library mcap:", EXTRA):
         from mcap.reader import make_reader
-    except ImportError as error:
-        raise MadocError(f"MCAP logs need the library mcap: {EXTRA} ({error})") from error
     try:
         with path.open("rb") as file:
             _check_chunks(file)

@@ -9,7 +9,7 @@ import numpy as np
 
 from madoc.data.logs.tables import Run, is_asked, tables_of
 from madoc.data.validation import LARGEST, LARGEST_OF_ALL, check_size, require_file
-from madoc.errors import MadocError
+from madoc.errors import MadocError, needing
 from madoc.runs.files import read_json
 
 _ROWS = 20_000
@@ -36,11 +36,9 @@ def read_columns(path: Path, wanted: Collection[str]) -> tuple[dict[str, np.ndar
     Raises:
         MadocError: The file is damaged, or the wanted columns are larger than `LARGEST`.
     """
-    try:
+    with needing("Parquet logs need pyarrow:", "madoc-calibration[logs]"):
         import pyarrow
         import pyarrow.parquet
-    except ImportError as error:
-        raise MadocError(f'Parquet logs need pyarrow: pip install "madoc-calibration[logs]" ({error})') from error
     try:
         with path.open("rb") as file:
             schema = pyarrow.parquet.read_schema(file)
