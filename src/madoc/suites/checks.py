@@ -8,6 +8,9 @@ from functools import cache
 from pathlib import Path
 
 from madoc import robots
+from madoc.data.formats import recognise
+from madoc.data.logs import files_of, visible_files
+from madoc.data.native import recognises as is_recorded
 from madoc.errors import MadocError, about
 from madoc.pipeline import refusals
 from madoc.pipeline.methods import learner_of
@@ -111,7 +114,7 @@ def content_of_log(path: str, *, own: bool) -> str:
     """
     place = Path(path)
     if place.is_dir():
-        files = _files_of(place, own=own)
+        files = files_of(place) if own else visible_files(place)
         if not files:
             raise MadocError(f"the folder {path} holds no files; name one with logs")
         return hashed([[str(file.relative_to(place)), content_of_file(str(file))] for file in files])
@@ -119,20 +122,8 @@ def content_of_log(path: str, *, own: bool) -> str:
         return hashed(place.name, content_of_file(path))
     if own:
         raise MadocError(f"there is no file or folder {path}; check the path")
-    from madoc.data.formats import recognise  # reads data formats, which only ids need
-
     recognise(place)
     return path
-
-
-def _files_of(folder: Path, *, own: bool) -> list[Path]:
-    """The files of a folder of logs that count: no hidden ones, and of a user's own robot those that are read."""
-    if own:
-        from madoc.data.logs import files_of  # reads data formats, which only folders need
-
-        return files_of(folder)
-    visible = (file for file in folder.rglob("*") if not any(p.startswith(".") for p in file.relative_to(folder).parts))
-    return sorted(file for file in visible if file.is_file())
 
 
 @cache
@@ -160,6 +151,4 @@ def _robot(task: str, physics: str | None, permission: Permission) -> Task:
 @cache
 def _may_tell_truth(paths: tuple[str, ...]) -> bool:
     """Whether a log may hold the true parameters: only a file that Madoc wrote does."""
-    from madoc.data.native import recognises
-
-    return any(recognises(Path(path)) for path in paths)
+    return any(is_recorded(Path(path)) for path in paths)

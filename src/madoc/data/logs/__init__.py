@@ -74,16 +74,18 @@ def read(
     return replace(dataset, findings=(*findings, *dataset.findings))
 
 
+def visible_files(folder: Path) -> list[Path]:
+    """The files of a folder and of those in it, but for hidden ones, in the order of their names."""
+    files = (file for file in folder.rglob("*") if file.is_file())
+    return sorted(file for file in files if not any(part.startswith(".") for part in file.relative_to(folder).parts))
+
+
 def files_of(folder: Path) -> list[Path]:
     """The files of a folder that count for what `read` makes of it, in the order of their names.
 
     Hidden files, prose and what is often kept beside logs do not count, nor does anything that Madoc itself has left.
     """
-    visible = sorted(
-        file
-        for file in folder.rglob("*")
-        if file.is_file() and not any(part.startswith(".") for part in file.relative_to(folder).parts)
-    )
+    visible = visible_files(folder)
     if parquet_reader.is_lerobot(folder) or is_minari(folder):
         return visible
     return [
@@ -145,4 +147,4 @@ def _distinct(runs: list[Run]) -> list[Run]:
     return named
 
 
-__all__ = ["files_of", "read"]
+__all__ = ["files_of", "read", "visible_files"]
