@@ -111,8 +111,9 @@ def test_a_log_of_a_finer_simulation_is_judged_with_its_timestep_or_beside_the_e
         terms = {term.cause: term for term in shorter.holdout.missing_terms}
         assert INTEGRATION not in terms and not any(term.explained > 0.01 for term in terms.values())
         late = Bench(problem, parts.held, jax.random.key(0), until=time.monotonic() + 60.0, rate=1e9, divided=4)
-        assert late.for_tests.problem is problem.with_shorter_timestep
-        assert replace(late, rate=1.0).for_tests.problem is problem  # with no time for it
+        for bench in (late, late.with_timestep_of(4)):
+            assert bench.for_tests.problem is problem.with_shorter_timestep
+            assert replace(bench, rate=1.0).for_tests.problem is problem  # with no time for it
     low, high = np.asarray(found.result.interval).T
     assert (np.maximum(low - truth, truth - high) < 1e-4 * (space.high - space.low)).all()
 

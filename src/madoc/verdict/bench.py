@@ -61,6 +61,7 @@ class Bench:
         tell: What is told of each part of the work.
         left_out: What there was no time for so far.
         divided: Into how many steps each timestep is divided for tests of what the model lacks, where there is time.
+        own: The bench with the model's own timestep, where this one has a shorter one.
 
     Raises:
         MadocError: Too few rows are held out, or they are not of the simulator's robot.
@@ -75,6 +76,7 @@ class Bench:
     tell: Callable[[str], None] = lambda part: None
     left_out: list[str] = field(default_factory=list)
     divided: int = 1
+    own: "Bench | None" = None
 
     def __post_init__(self) -> None:
         if len(self.held_out) < FEWEST_HELD:
@@ -139,14 +141,19 @@ class Bench:
         """
         if timesteps == 1:
             return self if tests == 1 else replace(self, divided=tests)
-        return replace(self, problem=self.problem.with_shorter_timestep, rate=self.rate / timesteps, divided=1)
+        shorter = self.problem.with_shorter_timestep
+        return replace(self, problem=shorter, rate=self.rate / timesteps, divided=1, own=self)
 
     @property
     def for_tests(self) -> "Bench":
-        """The bench on which it is tested what the model lacks: with `divided` timesteps, if there is time for that."""
+        """The bench on which it is tested what the model lacks.
+
+        It has the shorter timestep that the log is likelier with, if there is time for that, and else the model's own,
+        whose error is one of the terms that are tested.
+        """
         shorter = self.with_timestep_of(self.divided)
         in_time = shorter.seconds_left >= shorter.windows_to_test * shorter.window_seconds
-        return shorter if in_time else self
+        return shorter if in_time else self.own or self
 
     @property
     def scaling(self) -> Scaling:
