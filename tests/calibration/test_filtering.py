@@ -306,10 +306,10 @@ def test_a_shorter_timestep_that_leaves_noise_explains_errors_that_are_unlike_it
     asked = back_to_filter(LeastSquaresState(None, (), "filtering", rest, None)).filtered
     assert asked.asked == "shorter" and not asked.settled
     (known, _), spent = counted(filtering.step, problem, asked, "cauchy")
-    lost = (
-        simulation.FINER * left_over.LARGER * left_over.LARGE * search.horizon
-    )  # a window that the first ensemble loses
-    assert spent - filtering.epoch_steps(problem, asked) in (0, lost, 2 * lost)
+    finer = simulation.FINER * search.horizon  # control steps of a state in a window with the shorter timestep
+    lost = finer * left_over.LARGER * left_over.LARGE  # a window that the first ensemble loses
+    spared = finer * asked.size * (instruments.MEMBERS + 2 * 2 * 2 * instruments.FEW)  # a step that is not needed
+    assert filtering.epoch_steps(problem, asked) - spent in (n * spared - m * lost for n in (0, 1) for m in range(4))
     assert known.settled and not known.found.unlike_noise and about_surprises(problem, known) == (TIMESTEP,)
     np.testing.assert_allclose(known.shorter_steps, -off, atol=0.05)
     np.testing.assert_array_equal(known.point, point)
@@ -326,6 +326,16 @@ def test_a_shorter_timestep_that_leaves_noise_explains_errors_that_are_unlike_it
     lacking = problem_of_foot(tmp_path, force=4.0)
     (left, _), _ = counted(filtering.step, lacking, replace(asked, alike=0.9, size=16), "cauchy")
     assert left.asked == "size" and left.alike == 0.9 and not left.shorter_steps.any()
+
+
+def test_the_curvature_follows_what_a_step_changes_of_the_gradient():
+    """Of the cost 3 x² + y² / 2, known as (x² + 4 y²) / 2: a step along x tells the first, one along y the second."""
+    true, known = np.diag([6.0, 1.0]), np.diag([1.0, 4.0])
+    along = left_over.curvature_after(known, np.array([0.1, 0.0]), true @ [0.1, 0.0])
+    np.testing.assert_allclose(along, np.diag([6.0, 4.0]))
+    np.testing.assert_allclose(left_over.curvature_after(along, np.array([0.0, 0.2]), true @ [0.0, 0.2]), true)
+    for step, change in (([0.0, 0.0], [1.0, 1.0]), ([0.1, 0.0], [-0.1, 0.0]), ([0.1, 0.0], [0.009, 0.0])):
+        np.testing.assert_array_equal(left_over.curvature_after(known, np.array(step), np.array(change)), known)
 
 
 def test_epochs_near_the_end_take_other_windows_and_count_together(tmp_path):

@@ -139,8 +139,8 @@ class Estimate:
             method does not estimate the noise.
         random_forces: By degree of freedom of the model, in its order; empty where none were found that are random.
         timesteps: Into how many steps each timestep of the model was divided for the estimate.
-        test_timesteps: The same for tests of what the model lacks: more where the log is likelier with a shorter
-            timestep.
+        test_timesteps: The same for tests of what the model lacks: more where intervals cover what a
+            shorter timestep changes.
         group_stability: Mean adjusted Rand index of the groups with those found from resampled states, or proposed in
             other epochs; 1 is the same groups, 0 chance. None where groups were not found from the problem.
         embeddings: One vector for each parameter, close together for those that act alike; None where none was learnt.

@@ -77,8 +77,8 @@ class CalibrationResult:
         random_forces: Standard deviation of random forces by degree of freedom, in N or N·m, new ones in each control
             step, that act on the machine besides what the model has; empty where none were found that are random.
         timesteps: Into how many steps each timestep of the model was divided for the estimate.
-        test_timesteps: The same for tests of what the model lacks, where there is time: more than one where the log is
-            likelier with a shorter timestep.
+        test_timesteps: The same for tests of what the model lacks, where there is time: more than one where
+            intervals cover what a shorter timestep changes.
         group_stability: How alike groups of resampled states are: their mean adjusted Rand index, 1 for the same
             groups, 0 for chance; None where the method did not find groups.
         chosen: Why `auto` took this method, in a sentence; None where the method was named.

@@ -148,7 +148,7 @@ class Bench:
     def for_tests(self) -> "Bench":
         """The bench on which it is tested what the model lacks.
 
-        It has the shorter timestep that the log is likelier with, if there is time for that, and else the model's own,
+        It has the shorter timestep, unless the log excludes that, if there is time for it, and else the model's own,
         whose error is one of the terms that are tested.
         """
         shorter = self.with_timestep_of(self.divided)

@@ -257,8 +257,8 @@ class FilterState:
         together: Number of epochs near the end that the last step was by, 0 before these.
         failures: Number of windows whose simulation failed.
         force: Size of random forces in N/√kg (`random_forces`), 0 until these are looked for.
-        shorter_steps: By how much the parameters move without the timestep's error; 0 where the log is not likelier so,
-            or that leaves what is unlike noise too.
+        shorter_steps: By how much the parameters move without the timestep's error; 0 where the log is likelier with
+            it, or without it errors are unlike noise too.
         asked: What is asked once the search has settled, and `nothing` before: whether a search from fitted starts
             leads to `exact` values, whether the log is likelier with a `shorter` timestep, by a `trial` whether random
             forces act, of what `size` they are, and nothing more when that is `known`.

@@ -1,7 +1,6 @@
 """What the filter's search leaves at its end: noise, the error of a timestep that is too long, or what forces make."""
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -23,7 +22,7 @@ LARGE, LARGE_ROUNDS, LARGER = 64, 2, 4
 often noise is estimated by them. Windows that such an ensemble loses are given to one so many times as large."""
 TRIAL, SIZE_ROUNDS = -1.5, 2
 """Power of ten of the size of random forces, in the largest one, with which it is asked whether any act, and how often
-noise is estimated for a size."""
+noise is estimated for a size, and with a shorter timestep."""
 SIZES, SMALLEST_SIZE = 8, -3.0
 """Number of sizes that are tried then, and power of ten of the smallest, in the largest."""
 BETTER = 2.0
@@ -31,14 +30,18 @@ BETTER = 2.0
 WHOLE = FINER / (FINER - 1)
 """What the whole error of a timestep changes, over what a timestep `FINER` times as short does: the error is in
 proportion to the timestep."""
-STEPS = 2
-"""Number of steps of the parameters with the shorter timestep, after which it is compared with the model's own."""
+STEPS = 3
+"""Largest number of steps of the parameters with the shorter timestep, before it is compared with the model's own."""
+LEAST_CURVED = 0.1
+"""Least curvature along a step, in that before it, that is believed: what is less is chance."""
 
 
 def members_for(state: FilterState) -> int:
     """Number of states that the question asked takes of each window; with a shorter timestep one counts as `FINER`."""
-    step = MEMBERS + 2 * 2 * len(state.point) * instruments.FEW
-    shorter = MEMBERS + step + FINER * (MEMBERS + STEPS * step + LARGE * int(state.unlike_noise))
+    pull = MEMBERS + 2 * 2 * len(state.point) * instruments.FEW
+    misfit = SIZE_ROUNDS * MEMBERS
+    shorter = pull + misfit + FINER * (STEPS * pull + misfit)
+    shorter = shorter + FINER * LARGE if state.unlike_noise else shorter // 2
     return {"shorter": shorter, "trial": 2 * SIZE_ROUNDS * MEMBERS, "size": (1 + SIZES) * SIZE_ROUNDS * MEMBERS}.get(
         state.asked, 0
     )
@@ -83,30 +86,41 @@ def with_what_is_left(
 def with_shorter_steps(
     windows: FilteredWindows, state: FilterState, rounding: Float[np.ndarray, " channels"], loss: Loss
 ) -> FilterState:
-    """The state with what a shorter timestep changes, where the log is likelier with it, and with what is asked next.
+    """The state with what a shorter timestep changes, unless the own one is certainly likelier, and what is asked next.
 
     A machine has no timesteps, and parameters make up for the error of the model's. Without it they would have other
     values, by `shorter_steps`: so far they must move until the same windows pull them no more than they do at the
-    search's end, by what all windows tell of them. Errors that are unlike noise and stay so have another cause.
+    search's end. The curvature is at first what all windows tell, and then corrected along each step by how much that
+    changed the pull. Errors that are unlike noise and stay so have another cause.
     """
     following = replace(state, asked="size" if state.unlike_noise else "trial", epochs=state.epochs + 1)
-    shorter = windows._replace(simulator=simulation.with_shorter_timestep(windows.simulator))
-    own, finer = _pull(windows, state, rounding, loss), state
+    if not state.unlike_noise:  # less is at stake then
+        windows = windows.of(np.arange(min(len(windows.rows), max(FEWEST + len(state.point), len(windows.rows) // 2))))
+    own = _pull(windows, state, loss)
     if own is None:
         return following
+    shorter = windows._replace(simulator=simulation.with_shorter_timestep(windows.simulator))
+    error = np.sqrt(np.maximum(np.diag(state.found.uncertainty.covariance), np.finfo(float).tiny))
     seen = state.squares.any((1, 2)).sum()
-    bread = instruments.agreed(state.products.sum(0), state.squares.sum(0)) / seen
+    curvature = instruments.agreed(state.products.sum(0), state.squares.sum(0)) / seen
+    finer, moved, before = state, np.zeros_like(state.point), own
     with counted_as(FINER):
         for _ in range(STEPS):
-            pull = _pull(shorter, finer, rounding, loss)
+            pull = _pull(shorter, finer, loss)
             if pull is None:
                 return following
-            change = np.linalg.solve(bread, own.gradient - pull.gradient)
-            change = np.clip(change, -instruments.LONGEST, instruments.LONGEST)
-            finer = replace(finer, point=np.clip(finer.point + change, -1.0, 1.0), noise=pull.noise)
-        after = _misfit(shorter, finer, rounding)
-    if not likelier(after, _misfit(windows, replace(state, noise=own.noise), rounding), len(state.point)):
+            curvature = curvature_after(curvature, moved, pull - before)
+            step = np.clip(np.linalg.solve(curvature, own - pull), -instruments.LONGEST, instruments.LONGEST)
+            point = np.clip(finer.point + step, -1.0, 1.0)
+            finer, moved, before = replace(finer, point=point), point - finer.point, pull
+            if instruments.moved_by(moved, error) < instruments.LIKE_CHANCE:
+                break
+        of_shorter, noise = _misfit(shorter, finer, rounding)
+    of_own, _ = _misfit(windows, state, rounding)
+    enough = np.isfinite(of_own - of_shorter).sum() >= FEWEST + len(state.point)
+    if not enough or likelier(of_own, of_shorter, len(state.point)):
         return following
+    finer = replace(finer, noise=noise)
     following = replace(following, shorter_steps=WHOLE * (finer.point - state.point))
     if not state.unlike_noise:
         return following
@@ -118,33 +132,41 @@ def with_shorter_steps(
     return replace(following, asked="known", cost=left.cost, alike=left.alike, explained_share=left.explained_share)
 
 
+def curvature_after(
+    curvature: Float[np.ndarray, "d d"], step: Float[np.ndarray, " d"], change: Float[np.ndarray, " d"]
+) -> Float[np.ndarray, "d d"]:
+    """The curvature by which a step changes the gradient as it did (Broyden, Fletcher, Goldfarb, Shanno 1970).
+
+    It stays as it is after no step, and where the change is not certainly that of a minimum.
+    """
+    expected = curvature @ step
+    if not step @ change > LEAST_CURVED * (step @ expected):
+        return curvature
+    return curvature + np.outer(change, change) / (step @ change) - np.outer(expected, expected) / (step @ expected)
+
+
 def _misfit(
     windows: FilteredWindows, state: FilterState, rounding: Float[np.ndarray, " channels"]
-) -> Float[np.ndarray, " windows"]:
-    """Misfit of each window's readings, the noise being that of this point."""
+) -> tuple[Float[np.ndarray, " windows"], Float[np.ndarray, " channels"]]:
+    """Misfit of each window's readings, and the noise at this point."""
     random = np.random.default_rng([state.seed, state.epochs, 4])
-    return with_noise(windows, state.point, state.noise, rounding, MEMBERS, 1, random)[0].misfit()
+    found, noise = with_noise(windows, state.point, state.noise, rounding, MEMBERS, SIZE_ROUNDS, random)
+    return found.misfit(), noise
 
 
-class _Pull(NamedTuple):
-    """The mean gradient of windows' cost at a point, and the noise that is found there."""
+def _pull(windows: FilteredWindows, state: FilterState, loss: Loss) -> Float[np.ndarray, " d"] | None:
+    """The mean gradient of windows' cost, by the same random numbers for all; None where too few are simulated whole.
 
-    gradient: Float[np.ndarray, " d"]
-    noise: Float[np.ndarray, " channels"]
-
-
-def _pull(
-    windows: FilteredWindows, state: FilterState, rounding: Float[np.ndarray, " channels"], loss: Loss
-) -> _Pull | None:
-    """What pulls the parameters, by the same random numbers for all; None where too few simulations are whole."""
+    Errors count in units of the noise at the search's end, as they do in its curvature.
+    """
     random = [np.random.default_rng([state.seed, state.epochs, number]) for number in range(3)]
-    found, noise = with_noise(windows, state.point, state.noise, rounding, MEMBERS, 1, random[2])
+    found, _ = with_noise(windows, state.point, state.noise, np.zeros_like(state.noise), MEMBERS, 1, random[2])
     sides = [Side.of(windows, found, state.point, state.spread, MEMBERS, each) for each in random[:2]]
     whole = found.whole[0] & sides[0].ends.whole.all(0) & sides[1].ends.whole.all(0)
     if whole.sum() < FEWEST + len(state.point):
         return None
     gradients, _, _ = instruments.products_of(sides[0], sides[1], whole, loss)
-    return _Pull(gradients.sum(0) / whole.sum(), noise)
+    return np.asarray(gradients.sum(0) / whole.sum())
 
 
 def with_trial(windows: FilteredWindows, state: FilterState, rounding: Float[np.ndarray, " channels"]) -> FilterState:

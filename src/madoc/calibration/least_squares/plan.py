@@ -85,8 +85,8 @@ class Found:
         unlike_noise: Whether residuals have longer tails than noise has, add up over longer windows, are each like the
             next, or follow from state and action.
         force: Size of random forces in N/√kg (`identification.random_forces`); 0 where none were found.
-        shorter_steps: By how much the parameters of a filter move without the timestep's error, where the log is
-            likelier so.
+        shorter_steps: By how much the parameters of a filter move without the timestep's error, unless the log is
+            likelier with it.
     """
 
     point: Float[np.ndarray, " d"]

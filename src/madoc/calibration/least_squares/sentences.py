@@ -36,7 +36,7 @@ STILL_TRYING = (
     "timestep makes the residuals that are unlike noise"
 )
 TIMESTEP = (
-    "the log is likelier with a timestep a quarter as long: the intervals also cover the estimate without the error of "
+    "the log does not exclude a timestep a quarter as long: the intervals also cover the estimate without the error of "
     "the model's timestep (give a shorter one in the spec to narrow them)"
 )
 PUSHED = (

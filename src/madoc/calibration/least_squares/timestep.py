@@ -4,7 +4,7 @@ A machine has no timesteps, and a log of a simulation has those of its simulator
 timestep that is too long, as a delay does for half a step, and what they cannot make up for hides what the model lacks.
 So the searches, once at their end, begin again there with a timestep a quarter as long. Their estimate counts if they
 leave certainly less noise, or nothing that adds up over longer windows where the others did. An ensemble filter, whose
-epochs are long, asks the same by two steps (`left_over`).
+epochs are long, asks the same by a few steps (`left_over`).
 """
 
 from collections.abc import Callable
