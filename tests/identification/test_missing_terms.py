@@ -129,6 +129,7 @@ def test_a_parameter_that_alternates_from_run_to_run_is_told():
         assert (term.cause, term.parameter) == (DRIFT, "gravity")
         assert (term.t > 5.0) == (apart > 0.0)
         assert bool(others) == (apart > 0.0)
+        assert term.explained == pytest.approx(0.5 * (apart > 0.0), abs=0.1)  # the noise is as large as the change
     assert term.value == pytest.approx(0.5, rel=0.2)  # the range is 2 wide, so 0.5 in [-1, 1] is 0.5 m/s²
     assert others[0].errors["gravity"] == pytest.approx(1.96 * 0.5 * np.sqrt(1.0 + 1.0 / 11.0) / 0.01, rel=0.2)
 

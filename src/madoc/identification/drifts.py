@@ -68,12 +68,13 @@ def _less_mean(chosen: Bool[np.ndarray, " windows"]) -> Float[np.ndarray, " wind
 
 
 def _drifts(tests: TermTests) -> Iterator[MissingTerm]:
-    """How each parameter changes over the log: in a straight line, in its first third, in its last, in every run.
+    """How each parameter changes over the log: in a straight line, after its first third, in its last, in every run.
 
-    A line's value is the change from the middle of the first third to that of the last, as those of the thirds are.
+    A line's value is the change from the middle of the first third to that of the last; the other two's are those from
+    the first third to the rest, and from the rest to the last third.
     """
     time, age = np.linspace(-1.0, 1.0, len(tests.products)), _since_begin(tests.runs)
-    shapes = [(DRIFT, shape - np.mean(shape)) for shape in (0.75 * time, time < -1.0 / 3.0, time > 1.0 / 3.0)]
+    shapes = [(DRIFT, shape - np.mean(shape)) for shape in (0.75 * time, time > -1.0 / 3.0, time > 1.0 / 3.0)]
     shapes += [(WITHIN_RUNS, age)] if len(np.unique(tests.runs)) > 1 and age.any() else []
     for index, row in enumerate(tests.space.parameters):
         for cause, shape in shapes:
@@ -116,11 +117,23 @@ def _between_runs(tests: TermTests) -> tuple[list[MissingTerm], list[Alternative
         deviation, error = np.sqrt([(freedom[index] + 1.0) * beyond, by_run[index]]).tolist()
         half, half_width = (row.high - row.low) / 2.0, float(tests.half_widths[index])
         shift = {row.name: deviation / half_width}
-        terms.append(MissingTerm(DRIFT, row.name, deviation * half, error * half, row.unit, 0.0, t, shift))
+        explained = _explained_by_runs(tests, index) if t >= SUSPICIOUS else 0.0
+        terms.append(MissingTerm(DRIFT, row.name, deviation * half, error * half, row.unit, explained, t, shift))
         if t >= SUSPICIOUS:  # then an interval is to hold the value of any run
             errors = {row.name: NORMAL_95 * float(np.hypot(deviation, error)) / half_width}
             others.append(Alternative((f"{row.name} changing from run to run",), {row.name: 0.0}, errors, True))
     return terms, others
+
+
+def _explained_by_runs(tests: TermTests, index: int) -> float:
+    """Share in [0, 1] of squared residuals that a value of its own in each run explains of a parameter.
+
+    Of R runs that have told as much, each with another value than all others explains R / (R - 1) times its part.
+    """
+    runs = np.unique(tests.runs)
+    alone = (score(tests.products, 1 + index, shape=_less_mean(tests.runs == run)) for run in runs)
+    parts = sum(found.explained for found in alone if found is not None)
+    return float(min(1.0, (1.0 - 1.0 / len(runs)) * parts))
 
 
 def _most_certain(drifts: Iterable[MissingTerm]) -> Iterable[MissingTerm]:
