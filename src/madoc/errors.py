@@ -38,7 +38,7 @@ def about(option: str) -> Iterator[None]:
 
 @contextmanager
 def needing(what: str, package: str) -> Iterator[None]:
-    """Refuse where an import in the block fails: the sentence is `what` needs the package, and how it is installed."""
+    """Refuse where an import in the block fails: `what` begins the sentence, how to install the package follows."""
     try:
         yield
     except ImportError as error:

@@ -73,5 +73,5 @@ def test_a_search_that_its_budget_has_ended_is_to_be_resumed_before_anything_els
 
 @pytest.mark.parametrize("left", [{"tested": False}, {"open_in_time": ("gravity",)}])
 def test_what_was_not_tested_is_to_be_tested_before_anything_is_looked_for(left):
-    assert "; better, first give it what the verdict asks for" in to_do(result_of("USABLE", **left))
+    assert "; better, first give it a larger budget (--budget) or a longer log" in to_do(result_of("USABLE", **left))
     assert to_do(result_of("NOT_IDENTIFIABLE", **left)) == to_do(result_of("NOT_IDENTIFIABLE"))

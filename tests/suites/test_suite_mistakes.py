@@ -61,7 +61,7 @@ def changed(old, new):
         (CELL + "    robots: [log.npz, other.npz]\n", 8, "robots: and data: both name logs"),
         (CELL.replace("    data: log.npz\n", "    robots: arm-*\n"), 4, "there is no file or folder arm-*"),
         (CELL + "    format: tape\n", 8, "unknown format 'tape'"),
-        (CELL + "    max_transitions: 0\n", 8, "at least 1 transition to keep, got 0"),
+        (CELL + "    max_transitions: 0\n", 8, "expected max_transitions of 1 or more, got 0"),
         (changed("log.npz", "''"), 4, "expected the log after --data, got nothing"),
         (CELL + "    truth: strange.json\n", 8, "unknown parameter of spring in the truth 'gravty'"),
         (HOPPER + "    learn: sac\n    evaluate: {draws: 0}\n", 5, "at least 1 draw, got 0"),

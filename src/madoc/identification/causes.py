@@ -54,7 +54,7 @@ CHANGE_MACHINE = (
 )
 """What to do about a force that a spec has no words for."""
 
-Group = Literal["term", "step", "late", "change", "force", "unlisted"]
+Group = Literal["term", "late", "change", "force", "unlisted"]
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,8 @@ class Cause:
     """What is told and done about a cause.
 
     Attributes:
-        group: A `term` of a parameter, of timing or of the base; the error of the integration `step`; a single drive or
-            sensor that is `late`; a parameter that `change`s; a `force` that no parameter adds; or an `unlisted` one.
+        group: A `term` of a parameter, of timing or of the base; a single drive or sensor that is `late`; a parameter
+            that `change`s; a `force` that no parameter adds; or an `unlisted` one.
         do: What a user can do where no parameter of a spec adds it.
         unusual: Whether a more usual cause that explains nearly as much is named in its place.
     """
@@ -89,7 +89,6 @@ CAUSES: dict[str, Cause] = {
         TILTS,
         Cause(do="level it, or tilt the gravity of the model (its option gravity) as the base is", unusual=True),
     ),
-    INTEGRATION: Cause("step"),
     LATE_DRIVE: Cause("late", unusual=True),
     LATE_SENSOR: Cause("late", "log it without its filter, or shift its column by that time", unusual=True),
     DRIFT: Cause("change", "calibrate to each run by itself"),

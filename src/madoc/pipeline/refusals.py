@@ -49,8 +49,7 @@ def check_calibration(order: CalibrationOrder, task: Task) -> None:
     with about("format"):
         check_format(order.source.reading.format)
     if rows is not None and rows < 1:
-        sentence = f"expected at least 1 transition to keep, got {rows}; give max_transitions another value"
-        raise MadocError(sentence, option="max_transitions")
+        raise MadocError(f"expected max_transitions of 1 or more, got {rows}", option="max_transitions")
     truth_of(order.truth, task, search.parameters)
 
 
@@ -67,7 +66,8 @@ def check_policy(order: PolicyOrder, task: Task, *, written: str = "--{}") -> No
     share, width, at = (written.format(name) for name in ("share", "width", "at"))
     places = get_args(Place)
     if order.at not in places:
-        raise unknown_name("place to learn at", order.at, places)
+        with about("at"):
+            raise unknown_name("place to learn at", order.at, places)
     if order.at != "calibrated" and not learner.needs_parameters:
         does_not = f"{learner.name} does not learn at given parameters"
         raise MadocError(f"{does_not}, so {at} {order.at} would change nothing; leave it out", option="at")

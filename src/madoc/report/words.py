@@ -28,10 +28,7 @@ TO_DO = {
 }
 """What to do first after each verdict of a search that has converged, where all was tested."""
 _RESUME = "resume the search with a larger budget (--resume, --budget)"
-_TEST = (
-    "first give it what the verdict asks for, a larger budget (--budget) or more log: not all was tested that the "
-    "model may lack"
-)
+_TEST = "first give it a larger budget (--budget) or a longer log: not all was tested that the model may lack"
 
 
 def to_do(result: CalibrationResult) -> str:

@@ -1,6 +1,6 @@
 """What is refused of a cell before anything starts, and what tells the contents of its files apart.
 
-What files hold is kept, so that ten thousand cells of one robot and one log read them once.
+What robots and logs hold is kept, so that ten thousand cells of one robot and one log read them once.
 """
 
 import hashlib
