@@ -109,11 +109,17 @@ def test_a_log_of_a_finer_simulation_is_judged_with_its_timestep_or_beside_the_e
         shorter = madoc.assess(replace(estimate, test_timesteps=4), parts.held)  # as a filter's, of its own timestep
         assert shorter.holdout.noise == found.holdout.noise and shorter.holdout.open_loop == found.holdout.open_loop
         terms = {term.cause: term for term in shorter.holdout.missing_terms}
+        assert shorter.holdout.tests == "shorter" and found.holdout.tests == "same"
+        assert shorter.verdict.word == "CALIBRATED"
         assert INTEGRATION not in terms and not any(term.explained > 0.01 for term in terms.values())
         late = Bench(problem, parts.held, jax.random.key(0), until=time.monotonic() + 60.0, rate=1e9, divided=4)
         for bench in (late, late.with_timestep_of(4)):
-            assert bench.for_tests.problem is problem.with_shorter_timestep
-            assert replace(bench, rate=1.0).for_tests.problem is problem  # with no time for it
+            shorter, beside = bench.for_tests()
+            assert shorter.problem is problem.with_shorter_timestep
+            assert beside == ("same" if bench.own else "shorter") and not bench.left_out
+            own, beside = replace(bench, rate=1.0).for_tests()  # with no time for it
+            assert own.problem is problem and beside == ("longer" if bench.own else "same")
+            assert bench.left_out.pop() == "tests with the shorter timestep"
     low, high = np.asarray(found.result.interval).T
     assert (np.maximum(low - truth, truth - high) < 1e-4 * (space.high - space.low)).all()
 

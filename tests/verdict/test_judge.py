@@ -17,6 +17,7 @@ from madoc.calibration.holdout import (
     ToldApart,
 )
 from madoc.commands.answer import EXIT_CODES
+from madoc.identification.causes import INTEGRATION
 from madoc.identification.term_tests import MissingTerm
 from madoc.verdict import Word, judge
 from madoc.verdict.judge import beats_mid_range, explains_all
@@ -227,6 +228,22 @@ def test_what_is_left_is_no_mismatch_while_it_looks_like_random_forces():
     # Where starts are fitted nothing tells random forces from what the model lacks.
     told = judge(changed(FITTED, LEFT_OVER))
     assert told.word == "MODEL_MISMATCH" and "times as much as noise does (mid-range" in told.sentence
+
+
+def test_errors_count_as_the_timesteps_only_if_they_were_measured_with_it():
+    """Friction explains too little to be named where the timestep, or nothing far beyond noise, makes the errors."""
+    small = MissingTerm("friction", "friction", 0.1, 0.01, "1", 0.004, 6.0, {"mass": 0.1})
+    step = MissingTerm(INTEGRATION, "", 1.0, 0.1, "1", 0.4, 9.0, {"mass": 0.2})
+    for good in (PREDICTED, FITTED):
+        left = changed(good, LEFT_OVER | {"estimate": errors(0.1, 0.8)})
+        own = replace(left, missing_terms=(step, small))
+        assert judge(own).word == "CALIBRATED" and explains_all(own)
+        finer = replace(own, tests="longer")  # the errors have no error of the own timestep, which was tested
+        assert judge(finer).word == "MODEL_MISMATCH" and not explains_all(finer)
+        shorter = replace(left, tests="shorter")
+        assert judge(shorter).word == "CALIBRATED" and explains_all(shorter)
+        assert judge(replace(left, missing_terms=(small,))).word == "MODEL_MISMATCH"
+        assert judge(replace(shorter, missing_terms=(small,))).word == "NOT_IDENTIFIABLE"  # it is certain
 
 
 @EITHER

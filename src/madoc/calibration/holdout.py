@@ -162,6 +162,7 @@ class Judged:
         alternatives: Other estimates that the log does not exclude, which the intervals cover.
         imitated: Terms that the model has none of and parameters imitate, which the intervals do not cover.
         richer: The model with the likeliest term, where a parameter of a spec adds it and there was time to test it.
+        tests: Whether what the model lacks was tested with the timestep of the errors, a `shorter`, or a `longer` one.
         tested: False where the log cannot tell whether the model lacks a term: it is too short, or tells no states.
         open_in_time: Parameters that only the alternatives leave open, where there was no time to test these on as many
             windows as usual.
@@ -184,6 +185,7 @@ class Judged:
     alternatives: tuple[Alternative, ...] = ()
     imitated: tuple[ImitatedTerm, ...] = ()
     richer: RicherModel | None = None
+    tests: Literal["same", "shorter", "longer"] = "same"
     tested: bool = True
     open_in_time: tuple[str, ...] = ()
     at_end: tuple[str, ...] = ()

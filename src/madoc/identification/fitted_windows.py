@@ -37,10 +37,10 @@ STRIDES = 20
 SHORTER = 4
 """Part of that length, and multiple of their number, of windows in which what is missing is told apart where it leaves
 far more than noise: it adds up over a window and hides itself then, and noise hides less."""
-NEGLIGIBLE = 1e-5
+NOTHING = 1e-5
 """Residual in typical changes of a stride; below it there is nothing to explain."""
-LEAST = 1e-3
-"""Residual in typical changes of a stride; no sensor is more precise, so smaller ones are alike by chance."""
+NEGLIGIBLE = 1e-3
+"""Residual in typical changes of a stride; no sensor is more precise, so smaller ones count as none."""
 LINEARISATIONS = 4
 """Largest number of times that derivatives are simulated anew in a fit."""
 STEPS = 4
@@ -287,7 +287,7 @@ def products_of(slopes: WindowSlopes, readings: Readings, count: int) -> Product
 def negligible(slopes: WindowSlopes) -> bool:
     """Whether there are residuals, and none of them is worth an explanation."""
     finite = slopes.finite
-    return bool(finite.any()) and float(np.abs(slopes.residuals[finite]).max()) < NEGLIGIBLE
+    return bool(finite.any()) and float(np.abs(slopes.residuals[finite]).max()) < NOTHING
 
 
 def noise_of(fit: Fit, readings: Readings) -> Float[np.ndarray, " channels"]:
@@ -298,10 +298,10 @@ def noise_of(fit: Fit, readings: Readings) -> Float[np.ndarray, " channels"]:
 def alike(fit: Fit, readings: Readings) -> float:
     """Correlation of what a fit leaves of a reading with what it leaves of the next, all signals in typical changes.
 
-    It is about 0 for noise. What is smaller than `LEAST` counts as 0.
+    It is about 0 for noise. What is smaller than `NEGLIGIBLE` counts as 0.
     """
     left = fit.left[fit.counted & fit.slopes.whole].reshape(-1, *readings.observed.shape[1:])
-    square = max(float((left**2).sum()), LEAST**2 * max(1, left.size))
+    square = max(float((left**2).sum()), NEGLIGIBLE**2 * max(1, left.size))
     return float((left[:, 1:] * left[:, :-1]).sum()) / square
 
 

@@ -72,8 +72,11 @@ def _is_small(term: MissingTerm, least: float) -> bool:
 
 
 def far_beyond_noise(holdout: Judged) -> bool:
-    """Whether even the parameters nearby that fit the hold-out best leave errors that noise does not explain."""
-    errors = holdout.errors if isinstance(holdout, JudgedByErrors) else None
+    """Whether even the parameters nearby that fit the hold-out best leave errors that noise does not explain.
+
+    Where a shorter timestep was tested, what that one lacks tells, as these may be errors of the longer one.
+    """
+    errors = holdout.errors if isinstance(holdout, JudgedByErrors) and holdout.tests != "shorter" else None
     return errors is not None and bool(beyond_noise(errors.nearby_best, errors.noise, certain=True))
 
 
@@ -121,6 +124,13 @@ def numerical(terms: Sequence[MissingTerm]) -> MissingTerm | None:
         return None
     others = (each.explained for each in terms if is_certain(each) and each.about.group != "change")
     return step if max(others, default=0.0) <= step.explained else None
+
+
+def of_timestep(holdout: Judged) -> bool:
+    """Whether errors beyond noise may be those of the timestep that they were measured with."""
+    if holdout.tests != "same":
+        return holdout.tests == "shorter"  # the log does not exclude it; a longer one tells of other errors
+    return numerical(holdout.missing_terms) is not None
 
 
 def integration(terms: Sequence[MissingTerm]) -> MissingTerm | None:

@@ -24,7 +24,7 @@ from madoc.verdict.records import EXCHANGED, TESTS, judged
 
 LATER = "predictions over longer times"
 """A part of judging without which nothing is tested."""
-TESTING = frozenset({EXCHANGED, TESTS, LATER})
+NEEDED = frozenset({EXCHANGED, TESTS, LATER})
 """All such parts."""
 NO_BETTER = "the estimate predicts the rows held out no better than mid-range does, so it is not settled"
 
@@ -104,7 +104,7 @@ def assess(
         settled=result.settled,
         unlike_noise=result.unlike_noise,
         effective=result.effective,
-        in_time=TESTING.isdisjoint(bench.left_out),
+        in_time=NEEDED.isdisjoint(bench.left_out),
         combinations=widened.combinations,
     )
     better = beats_mid_range(holdout) or explains_all(holdout)

@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
@@ -144,16 +145,23 @@ class Bench:
         shorter = self.problem.with_shorter_timestep
         return replace(self, problem=shorter, rate=self.rate / timesteps, divided=1, own=self)
 
-    @property
-    def for_tests(self) -> "Bench":
-        """The bench on which it is tested what the model lacks.
+    def for_tests(self) -> tuple["Bench", Literal["same", "shorter", "longer"]]:
+        """The bench on which it is tested what the model lacks, and its timestep beside that of this one.
 
         It has the shorter timestep, unless the log excludes that, if there is time for it, and else the model's own,
         whose error is one of the terms that are tested.
         """
         shorter = self.with_timestep_of(self.divided)
-        in_time = shorter.seconds_left >= shorter.windows_to_test * shorter.window_seconds
-        return shorter if in_time else self.own or self
+        if shorter.seconds_left >= shorter.test_seconds:
+            return shorter, "same" if self.divided == 1 else "shorter"
+        if self.divided > 1 or self.own is not None:
+            self.left_out.append("tests with the shorter timestep")
+        return (self, "same") if self.own is None else (self.own, "longer")
+
+    @property
+    def test_seconds(self) -> float:
+        """About how long testing the model takes at least, in s."""
+        return self.windows_to_test * self.window_seconds
 
     @property
     def scaling(self) -> Scaling:
@@ -192,7 +200,7 @@ class Bench:
             return None
         columns = replay_steps(self.states, stride(self.problem.dataset), len(self.simulator.parameters))
         count = len(self.fittable.rows)
-        room = 1.0 - self.windows_to_test * self.window_seconds / max(self.seconds_left, 1e-9)
+        room = 1.0 - self.with_timestep_of(self.divided).test_seconds / max(self.seconds_left, 1e-9)
         share = min(room, FITTING) if room >= LEAST_FITTING else FITTING
         most = self.windows_in_time(columns, share, count)
         return replace(

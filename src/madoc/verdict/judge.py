@@ -14,7 +14,7 @@ from madoc.identification.combinations import Combination
 from madoc.identification.information import OPEN
 from madoc.identification.missing_terms import OTHER_WINDOWS
 from madoc.identification.term_tests import named
-from madoc.verdict.adequacy import is_certain, numerical
+from madoc.verdict.adequacy import is_certain, numerical, of_timestep
 from madoc.verdict.mismatch import (
     SEPARABLE,
     at_most,
@@ -93,7 +93,7 @@ def judge(
         or _untested(holdout, in_time=in_time)
         or _beyond_noise_later(holdout)
         or _small_but_certain(holdout)
-        or (_not_certain(holdout, EFFECTIVE) if effective and numerical(holdout.missing_terms) is None else None)
+        or (_not_certain(holdout, EFFECTIVE) if effective and not of_timestep(holdout) else None)
         or Verdict("CALIBRATED", f"{_how_good(holdout)}, and {_how_sure(holdout)}")
     )
 
@@ -148,7 +148,7 @@ def explains_all(holdout: HoldOut) -> bool:
     if isinstance(holdout, ToldApart):
         return holdout.area_at_estimate.interval[0] <= 0.5
     noise_alone = not beyond_noise(holdout.errors.estimate, holdout.errors.noise)
-    return noise_alone or numerical(holdout.missing_terms) is not None
+    return noise_alone or of_timestep(holdout)
 
 
 def beats_mid_range(holdout: HoldOut) -> bool:

@@ -6,10 +6,10 @@ import numpy as np
 
 from madoc.calibration.holdout import Area, Fitted, HoldOut, PredictionErrors, ToldApart, Verdict
 from madoc.identification.causes import ONE_RUN, WITHIN_RUNS
+from madoc.identification.fitted_windows import NEGLIGIBLE
 from madoc.identification.term_tests import MissingTerm, named
-from madoc.verdict.adequacy import CERTAIN, as_likely, far_beyond_noise, integration, missing_term, numerical
+from madoc.verdict.adequacy import CERTAIN, as_likely, far_beyond_noise, integration, missing_term, of_timestep
 from madoc.verdict.remedies import addition, is_of_spec, remedy, value_of
-from madoc.verdict.statistics import NEGLIGIBLE
 
 _MOST_NAMED = 3
 """Largest number of terms that a sentence names beside the likeliest."""
@@ -27,7 +27,7 @@ def lacking(holdout: HoldOut, *, settled: bool, unlike_noise: bool) -> Verdict |
     """
     holdout = holdout if settled else replace(holdout, at_end=(), open_at_end=())
     found = _missing(holdout, missing_term(holdout)) or _mismatch(holdout)
-    if far_beyond_noise(holdout) and numerical(holdout.missing_terms) is None:
+    if far_beyond_noise(holdout) and not of_timestep(holdout):
         found = found or _missing(holdout, missing_term(holdout, least=0.0))
     found = found or _outside(holdout)
     return found or (_unlike_noise(holdout) if unlike_noise else None)
@@ -156,7 +156,7 @@ def _outside(holdout: HoldOut) -> Verdict | None:
 
 def _unlike_noise(holdout: HoldOut) -> Verdict | None:
     """Residuals unlike noise, where the error of the integration step does not explain them."""
-    if numerical(holdout.missing_terms) is not None:
+    if of_timestep(holdout):
         return None
     return Verdict(
         "MODEL_MISMATCH",
@@ -168,7 +168,7 @@ def _unlike_noise(holdout: HoldOut) -> Verdict | None:
 
 
 def _mismatch(holdout: HoldOut) -> Verdict | None:
-    if numerical(holdout.missing_terms) is not None:
+    if of_timestep(holdout):
         return None
     sentence = ""
     if isinstance(holdout, ToldApart):

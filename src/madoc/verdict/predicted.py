@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from madoc.calibration.holdout import Predicted, PredictionErrors
 from madoc.data import stride
 from madoc.identification import noise as sensors
+from madoc.identification.fitted_windows import NEGLIGIBLE
 from madoc.identification.losses import NORMAL_MAD
 from madoc.identification.states import logged_states
 from madoc.identification.systematic import explained
@@ -18,7 +19,6 @@ from madoc.verdict.bench import Bench
 from madoc.verdict.prediction import Replays, nearby_best
 from madoc.verdict.records import judged
 from madoc.verdict.statistics import (
-    NEGLIGIBLE,
     best_of,
     hides_gain,
     independent_groups,

@@ -14,7 +14,7 @@ from madoc.data.findings import Finding
 from madoc.diagnosis.exchanged_columns import exchanged_columns
 from madoc.identification.causes import INTEGRATION, LAG
 from madoc.identification.excitation import WINDOWS, expected_half_widths
-from madoc.identification.fitted_windows import SHORTER, windows_of
+from madoc.identification.fitted_windows import NEGLIGIBLE, SHORTER, windows_of
 from madoc.identification.information import OPEN
 from madoc.identification.missing_terms import OTHER_WINDOWS, suspicions
 from madoc.identification.term_tests import Alternative, MissingTerm, Suspicions
@@ -31,7 +31,6 @@ from madoc.verdict.adequacy import (
 from madoc.verdict.bench import Bench
 from madoc.verdict.remedies import is_of_spec
 from madoc.verdict.richer import Tested, in_turn, richer_model
-from madoc.verdict.statistics import NEGLIGIBLE
 
 _MOST_TERMS = 5
 """Number of missing terms that a report keeps, the most significant ones; besides them the integration step's and all
@@ -115,7 +114,7 @@ def judged(
     if interval is not None:  # to the farther end, as the other may be cut off at an end of the range
         own = np.maximum(np.abs(space.to_unit(interval.T) - point).max(0), 1e-9)
     exchanged = _exchanged(bench, point, at)  # tests take what is left of the time
-    testing = bench.for_tests
+    testing, timestep = bench.for_tests()
     doubts = _doubts(testing, point, own)
     against = [each for each in (*exchanged, *problem.dataset.findings) if each.contradicts]
     ends = point[:, None] + np.outer(own, (-1.0, 1.0)) if interval is None else space.to_unit(interval.T).T
@@ -138,6 +137,7 @@ def judged(
         missing_terms=_worth_keeping(doubts.terms),
         alternatives=doubts.alternatives,
         imitated=doubts.imitated,
+        tests=timestep,
         tested=doubts.tested and EXCHANGED not in bench.left_out,
         open_in_time=tuple(itertools.compress(space.names, (shares >= OPEN) & (narrower < OPEN))),
         at_end=tuple(space.names[index] for index in at_end if narrower[index] < OPEN),

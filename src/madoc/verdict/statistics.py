@@ -6,10 +6,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from madoc.calibration.holdout import PredictionError, PredictionErrors
+from madoc.identification.fitted_windows import NEGLIGIBLE
 from madoc.identification.information import CONFIDENCE
 
-NEGLIGIBLE = 1e-3
-"""Residual in typical changes of a signal in a stride; no sensor is more precise, so smaller ones count as none."""
 ABOVE_NOISE = 2.0
 """Ratio of an error to that of noise alone, at least 1; above it noise does not explain the error. Noise estimated from
 a few hundred rows is within about 50 % of the true one."""
