@@ -87,15 +87,6 @@ def test_episodes_of_ten_rows_have_windows_behind_their_first_row():
     np.testing.assert_array_equal(windows.earlier, np.repeat(firsts[:, None], 9, axis=1))
 
 
-def test_shorter_windows_are_as_many_times_more():
-    task = spring(max_episode_steps=100)
-    dataset = recorded(task, SPRING_TRUTH, 20_000, jax.random.key(0))
-    given = dataset, states_of(dataset, simulation.make(task, threads=1)), typical_change(dataset)
-    usual, shorter = windows_of(*given, fewest=30), windows_of(*given, fewest=30, shorter=4)
-    assert shorter.readings.steps == usual.readings.steps // 4
-    assert len(shorter.readings) == 4 * len(usual.readings)
-
-
 def test_what_is_left_is_alike_in_a_row_where_it_is_not_noise():
     """By hand, in 100 windows of 5 readings of 3 signals: 4 products of neighbours to 5 squares."""
     readings, same = (

@@ -24,7 +24,7 @@ def with_term(dataset, simulator, lacking):
     """The model with the parameter that adds a term, from near the estimate."""
     point = simulator.parameters.to_unit(np.array([0.1]))
     given = dataset, states_of(dataset, simulator), simulator, point, WIDTHS, typical_change(dataset), [lacking]
-    return richer_model(*given, most=None, shorter=1)[0]
+    return richer_model(*given, most=None)[0]
 
 
 @pytest.mark.parametrize(

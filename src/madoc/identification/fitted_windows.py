@@ -34,9 +34,6 @@ WINDOWS = 120
 about 10 % with so many."""
 STRIDES = 20
 """A window's length in strides; over longer ones derivatives no longer predict what a small error of the model does."""
-SHORTER = 4
-"""Part of that length, and multiple of their number, of windows in which what is missing is told apart where it leaves
-far more than noise: it adds up over a window and hides itself then, and noise hides less."""
 NOTHING = 1e-5
 """Residual in typical changes of a stride; below it there is nothing to explain."""
 NEGLIGIBLE = 1e-3
@@ -80,14 +77,13 @@ def windows_of(
     *,
     fewest: int,
     most: int | None = None,
-    shorter: int = 1,
 ) -> LoggedWindows:
     """Windows to test a model by, evenly spread over the log.
 
     They are shorter than `STRIDES` where the log has not enough rows for `fewest` of that length, or where the episode
     of its median row is shorter. Where every row is an episode of its own they are single rows, as many as make up
     those windows, and the action before each, which is not known, is taken to be its own. There are `most` windows at
-    most, where that is given. With `shorter` they are so many times as short and as many.
+    most, where that is given.
     """
     lengths = dataset.episode_ends - dataset.episode_starts
     age = logged.rows - dataset.episode_starts[dataset.episode_of(logged.rows)]
@@ -98,11 +94,11 @@ def windows_of(
     affordable = min(max(stride(dataset), len(dataset) // fewest - 2), usual)
     loose = bool(lengths.max() == 1)
     rows, states = logged.rows[loose | (age > 0)], logged.states[loose | (age > 0)]
-    steps, chosen = min(max(1, STRIDES * stride(dataset) // shorter), affordable), np.zeros(0, np.int64)
+    steps, chosen = min(STRIDES * stride(dataset), affordable), np.zeros(0, np.int64)
     if len(rows):
         steps = longest_fit(dataset, rows, steps)
-        usually = max(WINDOWS * STRIDES if loose else shorter * WINDOWS, fewest)
-        count = usually if most is None else min(usually, shorter * most)
+        usually = max(WINDOWS * STRIDES if loose else WINDOWS, fewest)
+        count = usually if most is None else min(usually, most)
         chosen = evenly(disjoint_windows(dataset, rows, steps), count)
     readings = Readings.at(dataset, logged, rows[chosen], steps, scale)
     runs = dataset.episode_of(rows[chosen])

@@ -75,7 +75,6 @@ def suspicions(
     *,
     of_other_model: bool = False,
     most: int | None = None,
-    shorter: int = 1,
 ) -> Suspicions:
     """Terms that the model may lack, and what including them would do to the estimate.
 
@@ -89,10 +88,9 @@ def suspicions(
         scale: Typical change of each signal in a step.
         of_other_model: Whether the estimate is another model's; alternatives then move by what other windows move it.
         most: Largest number of windows; None for the usual one.
-        shorter: How many times as short and as many windows are.
     """
     began = SIMULATED.control_steps
-    windows = windows_of(dataset, logged, scale, fewest=2 * (FEWEST + len(point)), most=most, shorter=shorter)
+    windows = windows_of(dataset, logged, scale, fewest=2 * (FEWEST + len(point)), most=most)
     readings, runs = windows.readings, windows.runs
     if len(readings) < FEWEST + len(point):
         return Suspicions(tested=False)

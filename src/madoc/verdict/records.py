@@ -14,7 +14,7 @@ from madoc.data.findings import Finding
 from madoc.diagnosis.exchanged_columns import exchanged_columns
 from madoc.identification.causes import INTEGRATION, LAG
 from madoc.identification.excitation import WINDOWS, expected_half_widths
-from madoc.identification.fitted_windows import NEGLIGIBLE, SHORTER, windows_of
+from madoc.identification.fitted_windows import NEGLIGIBLE, windows_of
 from madoc.identification.information import OPEN
 from madoc.identification.missing_terms import OTHER_WINDOWS, suspicions
 from madoc.identification.term_tests import Alternative, MissingTerm, Suspicions
@@ -52,14 +52,11 @@ TESTING = 0.7
 Measure = TypeVar("Measure", bound=Judged)
 
 
-def _doubts(
-    bench: Bench, point: Float[np.ndarray, " d"], half_widths: Float[np.ndarray, " d"], shorter: int = 1
-) -> Suspicions:
+def _doubts(bench: Bench, point: Float[np.ndarray, " d"], half_widths: Float[np.ndarray, " d"]) -> Suspicions:
     """What the log says against the model.
 
     A log that tells neither states nor what is needed to fit them cannot be tested, nor can one without pairs of
-    consecutive observations. Under a limit of time windows are as many as that allows. With `shorter` they are so many
-    times as short and as many.
+    consecutive observations. Under a limit of time windows are as many as that allows.
     """
     problem = bench.problem
     ordered = bool((problem.dataset.episode_ends - problem.dataset.episode_starts > 1).any())
@@ -68,13 +65,12 @@ def _doubts(
         return Suspicions(tested=False)
     given, most = (problem.dataset, bench.states), _windows_in_time(bench)
     enough = most is None or most >= bench.windows_to_test
-    part = TESTS if shorter == 1 else "the same tests on shorter windows"
-    if not bench.begins(part, 0.0 if enough else np.inf):
+    if not bench.begins(TESTS, 0.0 if enough else np.inf):
         return Suspicions(tested=False)
     usual = len(windows_of(*given, bench.change, fewest=bench.windows_to_test).rows)
-    if shorter == 1 and most is not None and most < usual:
+    if most is not None and most < usual:
         bench.left_out.append(FEWER)
-    doubts = suspicions(*given, problem.simulator, point, half_widths, bench.change, most=most, shorter=shorter)
+    doubts = suspicions(*given, problem.simulator, point, half_widths, bench.change, most=most)
     alternatives = in_full((*doubts.alternatives, *of_small_terms(doubts.terms)), doubts.terms)
     return replace(doubts, alternatives=alternatives)
 
@@ -143,14 +139,10 @@ def judged(
         at_end=tuple(space.names[index] for index in at_end if narrower[index] < OPEN),
         open_at_end=tuple(space.names[index] for index in at_end if by_noise[index] < OPEN <= narrower[index]),
     )
-    shorter = SHORTER if far_beyond_noise(found) and missing_term(found) is None else 1
-    if shorter > 1:
-        doubts = _doubts(testing, point, own, shorter)
-        found = _told_apart(found, doubts)
     unexplained = far_beyond_noise(found) and missing_term(found) is None
     told = tuple(each.sentence for each in against if unexplained or not each.rough)
     term = missing_term(found)
-    tested = partial(_richer, testing, point, own, doubts=doubts, shorter=shorter)
+    tested = partial(_richer, testing, point, own, doubts=doubts)
     richer = tested(term)
     if term is not None and richer is not None and richer.left and term.parameter.startswith(_DELAYED):
         lag = replace(term, cause=LAG, parameter=term.parameter.replace(_DELAYED, "action_lag", 1))
@@ -176,17 +168,6 @@ def _worth_keeping(terms: Sequence[MissingTerm]) -> tuple[MissingTerm, ...]:
     return tuple(itertools.compress(terms, kept))
 
 
-def _told_apart(found: Measure, doubts: Suspicions) -> Measure:
-    """The record with the terms that tests on shorter windows find, beside the error of the integration step before.
-
-    That error is what tells whether anything is lacking at all, which windows of the usual length say.
-    """
-    step = [term for term in found.missing_terms if term.cause == INTEGRATION]
-    others = [term for term in _worth_keeping(doubts.terms) if term.cause != INTEGRATION]
-    terms = tuple(sorted((*step, *others), key=lambda term: -abs(term.t)))
-    return replace(found, missing_terms=terms) if doubts.tested else found
-
-
 def _richer(
     bench: Bench,
     point: Float[np.ndarray, " d"],
@@ -194,7 +175,6 @@ def _richer(
     term: MissingTerm | None,
     *,
     doubts: Suspicions,
-    shorter: int,
 ) -> RicherModel | None:
     """The model with a term, and with others in turn, if parameters of a spec add them and there is time for tests."""
     if term is None or not is_of_spec(term) or not doubts.tested:
@@ -205,7 +185,7 @@ def _richer(
         part = f"the model with {' and '.join(each.parameter for each in terms)}"
         if not bench.begins(part, BEFORE_OTHERS * doubts.control_steps / bench.rate):
             return None
-        return richer_model(*given, terms, most=_windows_in_time(bench), shorter=shorter)
+        return richer_model(*given, terms, most=_windows_in_time(bench))
 
     return in_turn(term, tested)
 

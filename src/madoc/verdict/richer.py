@@ -62,7 +62,6 @@ def richer_model(
     terms: Sequence[MissingTerm],
     *,
     most: int | None,
-    shorter: int,
 ) -> Tested:
     """The model with the parameters of terms, put to the tests.
 
@@ -75,7 +74,6 @@ def richer_model(
         scale: Typical change of each signal in a stride.
         terms: The terms, each of which a parameter of a spec adds, in the order in which they were found.
         most: Largest number of windows; None for the usual one.
-        shorter: How many times as short and as many they are, as in the tests that found the terms.
     """
     added, task = [line_of(term) for term in terms], simulator.task
     space = ParameterSpace((*simulator.parameters.parameters, *added))
@@ -94,7 +92,7 @@ def richer_model(
         start += widths * [term.shifts.get(name, 0.0) for name in space.names]
     logged = logged if wide.task.pending == simulator.task.pending else states_of(dataset, wide)
     at = np.clip(start, -1.0, 1.0)
-    found = suspicions(dataset, logged, wide, at, widths, scale, of_other_model=True, most=most, shorter=shorter)
+    found = suspicions(dataset, logged, wide, at, widths, scale, of_other_model=True, most=most)
     left = [each for each in found.terms if each.cause != INTEGRATION and abs(each.t) >= LIKELY_FORCE]
     more = (f"something that lasts over several rows (correlation {found.alike:.2f})",) if found.alike > WHITE else ()
     model = RicherModel(terms[0].parameter, (*map(named, left), *more), tuple(terms[1:]))
