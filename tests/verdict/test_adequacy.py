@@ -178,7 +178,7 @@ def test_an_error_of_the_timestep_that_explains_much_has_a_possible_value():
     coarse = term(INTEGRATION, t=20.0, explained=0.4, parameter="")
     assert numerical([coarse]) is coarse
     assert numerical([term(INTEGRATION, t=20.0, explained=0.2)]) is None
-    assert numerical([term(INTEGRATION, t=4.9, explained=0.4)]) is None
+    assert numerical([term(INTEGRATION, t=1.9, explained=0.4)]) is None
     assert numerical([replace(coarse, value=3.5)]) is None
     assert numerical([replace(coarse, value=-0.5)]) is None
     delay = term("late actions", t=14.0, explained=0.8)
@@ -220,4 +220,4 @@ def test_a_term_beside_the_error_of_the_timestep_is_named_though_that_explains_m
     assert missing_term(held(replace(step, t=1.9), left)) == left  # an error that may be chance was not taken away
     assert missing_term(held(replace(step, value=3.0), left)) == left  # nor one of another effect
     assert numerical([replace(step, explained=0.3), term(explained=0.31)]) is None
-    assert numerical([replace(step, explained=0.29)]) is None and numerical([replace(step, t=4.9)]) is None
+    assert numerical([replace(step, explained=0.29)]) is None and numerical([replace(step, t=1.9)]) is None

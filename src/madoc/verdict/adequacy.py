@@ -120,7 +120,7 @@ def is_certain(term: MissingTerm) -> bool:
 def numerical(terms: Sequence[MissingTerm]) -> MissingTerm | None:
     """The error of the integration step, where it explains much of the residuals, and no certain term explains more."""
     step = integration(terms)
-    if step is None or step.t < CERTAIN or step.explained < NUMERICAL:
+    if step is None or step.t < SUSPICIOUS or step.explained < NUMERICAL:
         return None
     others = (each.explained for each in terms if is_certain(each) and each.about.group != "change")
     return step if max(others, default=0.0) <= step.explained else None
