@@ -26,7 +26,7 @@ SCALED = (
 PLACE, RATIOS, MASSES = (
     "check one distance with a ruler",
     "only ratios can be found",
-    "no log can show whether masses and forces are right together",
+    "motion tells the ratios of forces to masses alone",
 )
 
 

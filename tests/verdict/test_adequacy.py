@@ -89,7 +89,7 @@ def test_intervals_and_combinations_cover_the_alternatives():
     ]
     lesser[-1] = replace(lesser[-1], errors={"mass": 0.0})
     wide = with_widened_intervals(result, held(alternatives=tuple(lesser)))
-    assert wide.warnings == [told + "friction, a load, lag and 1 more"]
+    assert wide.warnings == [told + "friction, a load, lag and 1 more effect"]
 
 
 def test_terms_that_parameters_imitate_are_told():
@@ -194,7 +194,7 @@ def test_terms_that_explain_nearly_as_much_are_as_likely():
 
 def test_a_coarse_integration_step_that_explains_more_is_told_first():
     step, friction = term(INTEGRATION, t=6.0, explained=0.1, parameter=""), term(explained=0.05)
-    first = "; first take a smaller timestep of the model, whose error explains 10 % (t = 6)"
+    first = "; first take a smaller timestep of the model, whose error explains 10 % (t = 6.0)"
     assert first in judge(held(step, friction)).sentence
     for terms in ((step, term(explained=0.2)), (replace(step, t=4.0), friction), (replace(step, value=3.5), friction)):
         assert "take a smaller timestep" not in judge(held(*terms)).sentence

@@ -65,8 +65,8 @@ def test_without_time_nothing_is_said_to_be_tested(result, split):
     assert "was not tested, as the budget left no time for that" in found.verdict.sentence
     assert found.holdout.open_loop == ()
     assert found.result.warnings[-1] == (
-        "the budget left no time for these parts of judging: exchanged columns; tests of what the model lacks; "
-        "predictions over longer times (give it a larger one with --budget)"
+        "the budget left no time for these parts of judging: whether columns are exchanged; tests of what the model "
+        "lacks; predictions over longer times (give it a larger one with --budget)"
     )
     in_full = madoc.assess(result, replace(bench, until=time.monotonic() + 1000.0, rate=1e5))
     assert max(in_full.holdout.open_loop[0].beside_noise.values()) < 1.3

@@ -108,7 +108,7 @@ def test_a_certain_term_is_a_mismatch_though_it_hardly_moves_the_estimate():
     verdict = judge(replace(PREDICTED, missing_terms=(offset,), richer=richer))
     assert verdict.word == "MODEL_MISMATCH"
     assert "the model lacks an offset of the sensor (signal_bias.hip): a value of 0.1 ± 0.01" in verdict.sentence
-    assert "(t = 10), and would move mass by +0.001 from 1.2 kg; a model with it explains the log" in verdict.sentence
+    assert "(t = 10.0), and would move mass by +0.001 from 1.2 kg; a model with it explains the log" in verdict.sentence
     assert verdict.sentence.endswith("{field: signal_bias, element: hip, low: 0, high: 0.2}")
 
 

@@ -180,8 +180,9 @@ class CalibrationResult:
         names, rows = list(self.parameters), list(self.parameters.values())
         group_of = {name: str(index) for index, group in enumerate(self.groups, 1) for name in group}
         errors = self.error["per_parameter"] if self.error else {}
+        some = any(row.given is not None for row in rows)  # elsewhere the elements of a parameter differ
         numbers = {
-            "as given": ["" if row.given is None else f"{row.given:.4g}" for row in rows],
+            "as given": [f"{row.given:.4g}" if row.given is not None else "differs" * some for row in rows],
             "estimate ± std": [f"{row.estimate:.4g} ± {row.std:.2g}" for row in rows],
             "95 %": [_span(row.interval) for row in rows],
             "range": [f"[{row.low:g}, {row.high:g}]" for row in rows],

@@ -65,8 +65,8 @@ def _scale_of_masses(names: list[str], *, only_ratios: bool) -> Finding:
         )
         return Finding("warning", what, "parameters", "take one of them out of the spec, at a value that was measured")
     what = (
-        "no log can show whether masses and forces are right together: were all gains of drives and all masses that "
-        f"are not calibrated 10 % off, {listed(names)} would be 10 % off as well, and no interval counts that"
+        "motion tells the ratios of forces to masses alone: were all masses and all gains of drives that are not "
+        f"calibrated 10 % off, {listed(names)} would be 10 % off as well, and no interval counts that"
     )
     return Finding(
         "note", what, "scale", "weigh a part, or measure a drive's torque, and put that into the model", kept=True

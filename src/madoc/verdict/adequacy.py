@@ -237,7 +237,8 @@ def _sentence(alternatives: tuple[Alternative, ...], names: tuple[str, ...]) -> 
     moved = np.array([widening((each,), names).max() for each in alternatives])
     furthest = [alternatives[index] for index in np.argsort(-moved, kind="stable") if moved[index] > 0.0]
     causes = [*dict.fromkeys(cause for each in furthest for cause in each.causes)]
-    others = f" and {len(causes) - NAMED} more" if len(causes) > NAMED else ""
+    more = len(causes) - NAMED
+    others = f" and {more} more effect{'s' * (more > 1)}" if more > 0 else ""
     return (
         "95 % intervals are wider than the standard deviations, which count noise alone: they also cover what the data "
         f"does not exclude, {', '.join(causes[:NAMED])}{others}"

@@ -344,7 +344,7 @@ def _how_good(holdout: HoldOut) -> str:
         right = _mid_range_was_right(holdout) and not holdout.open_in_time
         confirmed = ", and mid-range is confirmed: every interval holds it" if right else ""
         told = _how_small(holdout.errors) if holdout.ahead is None else _beside_given(holdout.ahead, holdout.noise)
-        ahead = f", up to {in_rows(holdout.errors.estimate[-1].steps)} ahead as well as the sensors' noise allows"
+        ahead = f", over the first {in_rows(holdout.errors.estimate[-1].steps)} with errors of the noise's size"
         noise_alone = not beyond_noise(holdout.errors.estimate, holdout.errors.noise)
         return f"{told}{ahead if noise_alone else ''}{confirmed}"
     return (

@@ -47,7 +47,7 @@ def _missing(holdout: HoldOut, term: MissingTerm | None) -> Verdict | None:
     return Verdict(
         "MODEL_MISMATCH",
         f"{lacks} {named(term)}: a value of {value} explains {100 * term.explained:.2g} % of the squared residuals "
-        f"(t = {abs(term.t):.0f}), and would move {effect}{_coarser(holdout, term)}; {_advice(holdout, term)}"
+        f"(t = {abs(term.t):.1f}), and would move {effect}{_coarser(holdout, term)}; {_advice(holdout, term)}"
         f"{_at_end(holdout)}{_disagreeing(holdout)}",
         tuple(moved),
     )
@@ -58,7 +58,7 @@ def _coarser(holdout: HoldOut, term: MissingTerm) -> str:
     step = integration(holdout.missing_terms)
     if step is None or step.t < CERTAIN or step.explained <= term.explained:
         return ""
-    explains = f"explains {100 * step.explained:.2g} % (t = {abs(step.t):.0f})"
+    explains = f"explains {100 * step.explained:.2g} % (t = {abs(step.t):.1f})"
     return f"; first take a smaller timestep of the model, whose error {explains}"
 
 
@@ -71,7 +71,7 @@ def _moved(holdout: HoldOut, term: MissingTerm, name: str) -> str:
 def _changing(holdout: HoldOut, term: MissingTerm) -> str:
     """How a parameter changes over the log, by how much, and what to do."""
     value = value_of(term)
-    moved = f"(t = {abs(term.t):.0f}; its estimate is {holdout.values[term.parameter][0]:.3g})"
+    moved = f"(t = {abs(term.t):.1f}; its estimate is {holdout.values[term.parameter][0]:.3g})"
     if term.cause.startswith(ONE_RUN):
         run = term.cause.removeprefix(f"{ONE_RUN} (").removesuffix(")")
         return (
@@ -117,7 +117,7 @@ def _advice(holdout: HoldOut, term: MissingTerm) -> str:
     if richer is None or richer.parameter != term.parameter:
         whole = "whether that is all that it lacks was not tested, so look for the cause before you add it to the spec"
     elif richer.left:
-        whole = f"a model with it still lacks {richer.left[0]}, so look for the cause before you add it to the spec"
+        whole = f"a model with it still lacks {richer.left[0]}, so look for the cause before you add either to the spec"
     else:
         whole = "find out on the machine which of them it is, and add that one to the spec's parameters"
     return "; ".join(part for part in (alike, whole) if part)

@@ -37,7 +37,7 @@ _MOST_TERMS = 5
 that are certain are kept, as a verdict rests on them."""
 NARROWEST = 0.1
 """Share in (0, 1) of the time left that the narrowest intervals which the log allows may take."""
-EXCHANGED = "exchanged columns"
+EXCHANGED = "whether columns are exchanged"
 """A part of judging without which nothing is tested."""
 TESTS = "tests of what the model lacks"
 """Another such part."""
@@ -182,7 +182,7 @@ def _richer(
     given = bench.problem.dataset, bench.states, bench.simulator, point, half_widths, bench.change
 
     def tested(terms: Sequence[MissingTerm]) -> Tested:
-        part = f"the model with {' and '.join(each.parameter for each in terms)}"
+        part = f"tests of the model with {' and '.join(each.parameter for each in terms)} as well"
         if not bench.begins(part, BEFORE_OTHERS * doubts.control_steps / bench.rate):
             return None
         return richer_model(*given, terms, most=_windows_in_time(bench))

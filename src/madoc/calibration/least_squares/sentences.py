@@ -49,8 +49,8 @@ NOT_SETTLED = (
 )
 STILL_LENGTHENING = "longer windows were under way when it ended: a larger budget may narrow the intervals"
 PREDICTS = (
-    "the model leaves more than noise, so the estimate is the one that predicts motion best over a second; its "
-    "distance from the estimate that fits short windows best counts as an error"
+    "the model does not explain the log to within its noise, so the estimate is the one that predicts best over a "
+    "second; its distance from the one that explains short windows best widens the intervals"
 )
 STILL_PREDICTING = (
     "a fit for prediction, as the model leaves more than noise, was under way when it ended: with a larger budget the "
@@ -118,7 +118,7 @@ def _why_states_are_not_known(problem: CalibrationProblem) -> str:
 def _how_large(problem: CalibrationProblem, noise: Float[np.ndarray, " channels"]) -> str:
     """The noise of the median channel."""
     rows = stride(problem.dataset)
-    change = "a step's typical change" if rows == 1 else f"the typical change in {rows} steps"
+    change = f"what a signal typically changes in {rows} row{'s' * (rows > 1)}"
     return f"the noise found is {100.0 * float(np.median(noise)):.2g} % of {change}"
 
 
@@ -128,7 +128,8 @@ def about_timestep(problem: CalibrationProblem) -> str:
     return (
         f"the log is likelier with a timestep of {own / FINER:.12g} s than with the model's of {own:.12g} s, so the "
         "parameters were estimated and tested with the shorter one, and do not make up for the error of the longer; "
-        "predictions over longer times are those of the model's own timestep"
+        f"simulate with {own:.12g} s all the same: predictions over longer times are made with it, and madoc export "
+        "keeps it"
     )
 
 

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from madoc.calibration.holdout import HoldOut
 from madoc.identification.combinations import Combination
-from madoc.identification.term_tests import Alternative, MissingTerm
+from madoc.identification.term_tests import LIKELY_FORCE, Alternative, MissingTerm
 from madoc.report.charts import matrix_chart, scatter_chart
 from madoc.report.reading import Run
 from madoc.report.words import interval_words, number, percent, unit_words, with_error
@@ -97,7 +97,7 @@ def lacks(run: Run) -> dict[str, object] | str:
         if causes.count(cause) > 1:
             rows[at]["cause"] = f"{cause}, shape {1 + causes[:at].count(cause)}"
     alternatives = [_words(each, held) for each in held.alternatives]
-    told = {"largest": number(largest, 2), "certain": number(CERTAIN)}
+    told = {"largest": number(largest, 2), "certain": number(CERTAIN), "likely": number(LIKELY_FORCE)}
     none_certain = bool(rows) and numerical(held.missing_terms) is None and not any(map(is_certain, held.missing_terms))
     return {"rows": rows, "alternatives": alternatives, "none_certain": none_certain} | told
 

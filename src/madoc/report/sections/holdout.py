@@ -34,7 +34,7 @@ def holdout(run: Run) -> dict[str, object] | str:
     lines = [
         _error_line("mid-range", errors.mid_range, "g3"),
         _error_line("what noise alone leaves", errors.noise, "chance", dashed=True),
-        _error_line("the best parameters nearby", errors.nearby_best, "g2"),
+        _error_line("fitted to the hold-out", errors.nearby_best, "g2"),
         _error_line("estimate", errors.estimate, "after"),
     ]
     chart = line_chart(
