@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.special import fdtrc, ndtri
 
 from madoc.identification.candidate_terms import Candidate
 from madoc.identification.causes import DRIFT, ONE_RUN, WITHIN_RUNS
@@ -99,9 +100,6 @@ def _between_runs(tests: TermTests) -> tuple[list[MissingTerm], list[Alternative
     Where all windows are alike, the variance of an estimate by leaving out runs is that by leaving out windows, and
     their ratio has Fisher's distribution.
     """
-    from scipy.stats import f as fisher  # slow to import, and only tests of terms need it
-    from scipy.stats import norm
-
     terms, others = list[MissingTerm](), list[Alternative]()
     if len(np.unique(tests.runs)) <= FEWEST_RUNS:
         return terms, others
@@ -110,9 +108,9 @@ def _between_runs(tests: TermTests) -> tuple[list[MissingTerm], list[Alternative
     for index, row in enumerate(tests.space.parameters):
         if freedom[index] < FEWEST_RUNS or not by_window[index] > 0.0:
             continue
-        chance = fisher.sf(by_run[index] / by_window[index], freedom[index], windows[index])
+        chance = fdtrc(freedom[index], windows[index], by_run[index] / by_window[index])
         # Runs that agree better than by chance, as where all repeat one motion, are no sign of a change.
-        t = float(norm.isf(np.clip(chance, np.finfo(float).tiny, 0.5)))
+        t = -float(ndtri(np.clip(chance, np.finfo(float).tiny, 0.5)))
         beyond = max(0.0, float(by_run[index] - by_window[index]))
         deviation, error = np.sqrt([(freedom[index] + 1.0) * beyond, by_run[index]]).tolist()
         half, half_width = (row.high - row.low) / 2.0, float(tests.half_widths[index])

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.special import stdtrit
 
 from madoc.identification.linearisation import Linearisation
 from madoc.identification.losses import Loss, loss_curvature, loss_slope
@@ -138,9 +139,7 @@ def half_width(covariance: Float[np.ndarray, "d d"], windows: int) -> Float[np.n
 
 def quantile(windows: int, parameters: int) -> float:
     """Standard errors in half of a 95 % interval: of Student's t with windows - parameters degrees of freedom."""
-    from scipy.stats import t  # slow to import, and only results need it
-
-    return float(t.ppf(0.5 + CONFIDENCE / 2.0, max(1, windows - parameters)))
+    return float(stdtrit(max(1, windows - parameters), 0.5 + CONFIDENCE / 2.0))
 
 
 def identifiability(uncertainty: Uncertainty, names: tuple[str, ...]) -> tuple[str, ...]:

@@ -73,7 +73,6 @@ def suspicions(
     half_widths: Float[np.ndarray, " d"],
     scale: Float[np.ndarray, " observation"],
     *,
-    of_other_model: bool = False,
     most: int | None = None,
 ) -> Suspicions:
     """Terms that the model may lack, and what including them would do to the estimate.
@@ -86,7 +85,6 @@ def suspicions(
             parameters would pass for missing terms.
         half_widths: Half of each parameter's 95 % interval in [-1, 1].
         scale: Typical change of each signal in a step.
-        of_other_model: Whether the estimate is another model's; alternatives then move by what other windows move it.
         most: Largest number of windows; None for the usual one.
     """
     began = SIMULATED.control_steps
@@ -108,11 +106,7 @@ def suspicions(
     terms = [*_terms(tests), *(replace(each, explained=tests.beside_steps * each.explained) for each in of_rest)]
     unlisted, covering = unlisted_forces(tests, families(simulator, responses), readings, fit, by_terms, responses)
     terms, others = [*terms, *unlisted], [*others, *covering]
-    for other in _of_other_windows(tests, led - point):
-        others.append(other)
-        if of_other_model:
-            shifts = np.array([other.shifts.get(name, 0.0) for name in tests.space.names])
-            tests = replace(tests, moved=shifts * half_widths)
+    others += _of_other_windows(tests, led - point)
     chosen = _chosen(tests)
     fitted, with_chosen = _of_chosen(tests, chosen, simulator, readings, fit, point)
     terms = [fitted.get(term.parameter, term) for term in terms]

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.special import fdtrc, ndtr, ndtri, stdtr, stdtrit
 
 REACH = 3.0
 """Length of a column of derivatives in a window relative to the median window's; a window with more is shrunk to it."""
@@ -118,9 +119,7 @@ class Score:
     @property
     def reach(self) -> float:
         """Half of the 95 % interval of the change, by Student's t."""
-        from scipy.stats import t as student  # slow to import, and only tests of terms need it
-
-        return float(student.ppf(0.975, self.freedom)) * self.error
+        return float(stdtrit(self.freedom, 0.975)) * self.error
 
 
 def deviate(ratio: float, freedom: float) -> float:
@@ -128,18 +127,13 @@ def deviate(ratio: float, freedom: float) -> float:
 
     With few degrees of freedom large ratios come by chance (Student 1908), so that thresholds would mean little.
     """
-    from scipy.stats import norm  # slow to import, and only tests of terms need it
-    from scipy.stats import t as student
-
-    chance = max(float(student.sf(abs(ratio), freedom)), np.finfo(float).tiny)
-    return float(np.copysign(norm.isf(chance), ratio))
+    chance = max(float(stdtr(freedom, -abs(ratio))), np.finfo(float).tiny)
+    return float(np.copysign(ndtri(chance), ratio))
 
 
 def shared_deviate(t: float, tests: int) -> float:
     """The normal deviate by whose probability one of so many tests exceeds t by chance, at most (Bonferroni 1936)."""
-    from scipy.stats import norm  # slow to import, and only tests of terms need it
-
-    return float(norm.isf(min(1.0, tests * max(float(norm.sf(t)), np.finfo(float).tiny))))
+    return -float(ndtri(min(1.0, tests * max(float(ndtr(-t)), np.finfo(float).tiny))))
 
 
 def score(
@@ -233,9 +227,6 @@ def _together(products: Products, terms: Sequence[int], already: Sequence[int]) 
     as many degrees of freedom as there are windows that tell of the columns. Only the largest principal components of
     columns count, one for `WINDOWS_EACH` windows at most; what they explain is what chance does not.
     """
-    from scipy.stats import f as fisher  # slow to import, and only tests of terms need it
-    from scipy.stats import norm
-
     included = [*products.parameters, *already]
     weights = _principal(products.each.sum(0), included, terms, max(1, len(products) // WINDOWS_EACH))
     count, few = len(included), weights.shape[1]
@@ -258,14 +249,14 @@ def _together(products: Products, terms: Sequence[int], already: Sequence[int]) 
         return None
     mean, spread = left.mean(0), np.atleast_2d(np.cov(left, rowvar=False))
     squared = len(left) * float(mean @ np.linalg.pinv(spread, rcond=_SINGULAR, hermitian=True) @ mean)
-    chance = float(fisher.sf((windows - few) / (few * (windows - 1)) * squared, few, windows - few)) / 2.0
+    chance = float(fdtrc(few, windows - few, (windows - few) / (few * (windows - 1)) * squared)) / 2.0
     change = -inverse @ left.sum(0)
     influence = (left + np.einsum("wij,j->wi", alone, change)) @ inverse
     scatter = influence.T @ influence * len(left) / max(1, len(left) - count - few)
     squares = each[:, 0, 0].sum() - 2.0 * fitted @ right.sum(0) + fitted @ total @ fitted
     response = -imitation[: products.count]
     return FamilyScore(
-        t=float(norm.isf(max(chance, np.finfo(float).tiny))),
+        t=-float(ndtri(max(chance, np.finfo(float).tiny))),
         changes=weights @ change,
         explained=max(0.0, float(change @ power @ change) - float(np.trace(scatter @ power))) / float(squares),
         shifts=response @ change,

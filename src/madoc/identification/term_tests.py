@@ -135,7 +135,6 @@ class TermTests:
         space: The calibrated parameters.
         half_widths: Half of each parameter's 95 % interval in [-1, 1].
         runs: The episodes that the windows are from.
-        moved: By how much these windows without any candidate move the estimate in [-1, 1]; a number for all, or each.
     """
 
     products: Products
@@ -143,7 +142,6 @@ class TermTests:
     space: ParameterSpace
     half_widths: Float[np.ndarray, " d"]
     runs: Int[np.ndarray, " windows"]
-    moved: Float[np.ndarray, " d"] | float = 0.0
 
     def score(self, index: int, beside: Sequence[int] = ()) -> Score | None:
         """The score of a candidate beside others; None if there is none, or if its value would not be physical."""
@@ -195,7 +193,7 @@ class TermTests:
         bounded: bool = False,
     ) -> Alternative:
         """The estimate with candidates that shift it by this much in [-1, 1], from the given one."""
-        return Alternative(causes, self.by_name(self.moved + shift), self.by_name(error), bounded=bounded)
+        return Alternative(causes, self.by_name(shift), self.by_name(error), bounded=bounded)
 
 
 def term_of(candidate: Candidate, found: Score, shifts: dict[str, float]) -> MissingTerm:

@@ -48,10 +48,6 @@ class Windows:
         """Length of each window in control steps."""
         return self.actions.shape[1]
 
-    def of(self, kept: Int[np.ndarray, " kept"]) -> "Windows":
-        """These windows alone."""
-        return Windows(self.states[kept], self.actions[kept], self.following[kept])
-
 
 def windows_at(
     dataset: Dataset, states: Float[np.ndarray, "windows state"], rows: Int[np.ndarray, " windows"], steps: int

@@ -92,7 +92,7 @@ def richer_model(
         start += widths * [term.shifts.get(name, 0.0) for name in space.names]
     logged = logged if wide.task.pending == simulator.task.pending else states_of(dataset, wide)
     at = np.clip(start, -1.0, 1.0)
-    found = suspicions(dataset, logged, wide, at, widths, scale, of_other_model=True, most=most)
+    found = suspicions(dataset, logged, wide, at, widths, scale, most=most)
     left = [each for each in found.terms if each.cause != INTEGRATION and abs(each.t) >= LIKELY_FORCE]
     more = (f"something that lasts over several rows (correlation {found.alike:.2f})",) if found.alike > WHITE else ()
     model = RicherModel(terms[0].parameter, (*map(named, left), *more), tuple(terms[1:]))

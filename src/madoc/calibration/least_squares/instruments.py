@@ -24,7 +24,7 @@ from typing import Literal
 import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from madoc.calibration.least_squares.plan import FEWEST, LONG_TAILS, Found
 from madoc.identification.ensembles import FilteredWindows, few_of, members_at
@@ -194,7 +194,7 @@ def axes_of(covariance: Float[np.ndarray, "d d"]) -> Float[np.ndarray, "d d"]:
 
 def moved_by(step: Float[np.ndarray, " d"], error: Float[np.ndarray, " d"]) -> float:
     """The largest component of a step in its standard errors, over the median of that of as many normal values."""
-    usual = norm.ppf((1.0 + 0.5 ** (1.0 / len(step))) / 2.0)
+    usual = ndtri((1.0 + 0.5 ** (1.0 / len(step))) / 2.0)
     return float((np.abs(step) / error).max() / usual)
 
 
