@@ -26,7 +26,7 @@ SCALED = (
 PLACE, RATIOS, MASSES = (
     "check one distance with a ruler",
     "only ratios can be found",
-    "motion tells the ratios of forces to masses alone",
+    "are as right as the masses and the gains of drives that are not calibrated",
 )
 
 

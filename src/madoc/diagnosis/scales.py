@@ -50,7 +50,7 @@ def scale_findings(
         findings.append(_scale_of_masses(names, only_ratios=only_ratios))
     if by_length:
         what = (
-            "no log can show the scale of positions here: were all of them logged too large, and every gain with them, "
+            "no log can show the scale of positions here: were all of them logged too large, and every drive's gain, "
             f"the fit would be as good, and {listed(names)} wrong"
         )
         findings.append(Finding("note", what, "scale", "check one distance with a ruler", kept=True))
@@ -65,8 +65,8 @@ def _scale_of_masses(names: list[str], *, only_ratios: bool) -> Finding:
         )
         return Finding("warning", what, "parameters", "take one of them out of the spec, at a value that was measured")
     what = (
-        "motion tells the ratios of forces to masses alone: were all masses and all gains of drives that are not "
-        f"calibrated 10 % off, {listed(names)} would be 10 % off as well, and no interval counts that"
+        f"{listed(names)} are as right as the masses and the gains of drives that are not calibrated: were all of "
+        "these 10 % off, so would those be, and no interval counts that"
     )
     return Finding(
         "note", what, "scale", "weigh a part, or measure a drive's torque, and put that into the model", kept=True

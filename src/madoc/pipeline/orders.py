@@ -91,7 +91,7 @@ class Search:
     set: Settings = ()
     """Hyperparameters of the method as name=value; of a method that auto may take as least-squares.name=value."""
     budget: int | str | None = None
-    """Simulated control steps, or the time of the whole command, judging included, as 300s or 15min. Default: 300s of
+    """Simulated control steps, or the time of the search and of judging, as 300s or 15min. Default: 300s of
     searching for least-squares, which settles by itself and mostly much sooner, and 450s with judging; 300000 control
     steps for the others."""
     seed: int = 0
@@ -107,7 +107,8 @@ class CalibrationOrder:
     source: OmitArgPrefixes[Source]
     search: OmitArgPrefixes[Search] = field(default_factory=Search)
     holdout: float | None = None
-    """Share of the rows that no method sees, to judge the result by. Default: 0.2 for auto, else none."""
+    """Share of the rows that no method sees, in whole runs where there are several, to judge the result by. Default:
+    0.2 for auto, else none."""
     truth: Path | None = None
     """JSON file {parameter: value} to judge the result by; no method ever sees it."""
 
@@ -140,9 +141,9 @@ class CheckOrder:
     clip_actions: bool = False
     """Clip actions outside their ranges instead of refusing them."""
     velocities: Velocities = "logged"
-    """differences puts velocities from positions where the logs have none, as `calibrate` does if told so."""
+    """With differences, velocities that the logs lack are differences of positions, as `calibrate` takes them too."""
     budget: int = 300_000
-    """Control steps of Madoc to forecast the time of; least squares settles by itself."""
+    """Control steps for which the time of other methods is forecast; least squares ends by itself."""
     forecast: Annotated[
         bool,
         arg(help="Do not forecast how long methods would take, the longest part of a check.", help_behavior_hint=""),

@@ -4,6 +4,7 @@ import math
 from functools import lru_cache
 from typing import Annotated, Literal
 
+import mujoco
 from pydantic import BeforeValidator, Field, WithJsonSchema, field_validator, model_validator
 
 from madoc.errors import nearest_hint
@@ -73,7 +74,7 @@ class ActionSpec(Part):
     limit: Positive | None = Field(None, description="Largest torque or force of a servo, N·m (of a slide, N).")
     drive: DriveSpec | None = Field(None, description="What drives the joint, where it is no ideal servo or motor.")
     unit: Unit | None = Field(
-        None, description="Of low, high and the log: deg, deg/s, mm, mm/s, cm, mN·m are converted, others are SI's."
+        None, description=f"Of low, high and the log: an SI unit, or one that is converted, {', '.join(SCALES)}."
     )
 
     @model_validator(mode="after")
@@ -128,7 +129,8 @@ class ParameterSpec(Part):
     @field_validator("field")
     @classmethod
     def _known(cls, field: str) -> str:
-        hint = nearest_hint(field, FIELDS)
+        of_model = f"it is an array of MuJoCo's model, so write model: {field}"
+        hint = of_model if hasattr(mujoco.MjModel, field) else nearest_hint(field, FIELDS)
         refuse(field not in (*FIELDS, "inertia"), f"expected a field that can be calibrated, got {field!r}; {hint}")
         return field
 
