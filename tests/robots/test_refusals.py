@@ -116,6 +116,7 @@ CHANGES = [
     ),
     # Parameters.
     (DAMPING, "  - {field: dof_dampng, element: elbow, low: 0, high: 1}", "got 'dof_dampng'; nearest: dof_damping"),
+    (DAMPING, "  - {field: jnt_margin, element: elbow, low: 0, high: 1}", "model is given by model: jnt_margin"),
     (
         DAMPING,
         "  - {field: dof_damping, element: elbw, low: 0, high: 1}",

@@ -109,7 +109,7 @@ def test_a_log_of_a_finer_simulation_is_judged_with_its_timestep_or_beside_the_e
         shorter = madoc.assess(replace(estimate, test_timesteps=4), parts.held)  # as a filter's, of its own timestep
         assert shorter.holdout.noise == found.holdout.noise and shorter.holdout.open_loop == found.holdout.open_loop
         terms = {term.cause: term for term in shorter.holdout.missing_terms}
-        assert shorter.holdout.tests == "shorter" and found.holdout.tests == "same"
+        assert shorter.holdout.timestep_of_tests == "shorter" and found.holdout.timestep_of_tests == "same"
         assert shorter.verdict.word == "CALIBRATED"
         assert INTEGRATION not in terms and not any(term.explained > 0.01 for term in terms.values())
         late = Bench(problem, parts.held, jax.random.key(0), until=time.monotonic() + 60.0, rate=1e9, divided=4)

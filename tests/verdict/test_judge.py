@@ -238,9 +238,11 @@ def test_errors_count_as_the_timesteps_only_if_they_were_measured_with_it():
         left = changed(good, LEFT_OVER | {"estimate": errors(0.1, 0.8)})
         own = replace(left, missing_terms=(step, small))
         assert judge(own).word == "CALIBRATED" and explains_all(own)
-        finer = replace(own, tests="longer")  # the errors have no error of the own timestep, which was tested
+        finer = replace(
+            own, timestep_of_tests="longer"
+        )  # the errors have no error of the own timestep, which was tested
         assert judge(finer).word == "MODEL_MISMATCH" and not explains_all(finer)
-        shorter = replace(left, tests="shorter")
+        shorter = replace(left, timestep_of_tests="shorter")
         assert judge(shorter).word == "CALIBRATED" and explains_all(shorter)
         assert judge(replace(left, missing_terms=(small,))).word == "MODEL_MISMATCH"
         assert judge(replace(shorter, missing_terms=(small,))).word == "NOT_IDENTIFIABLE"  # it is certain

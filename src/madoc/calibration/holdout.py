@@ -11,6 +11,8 @@ from pydantic import Field
 
 from madoc.identification.term_tests import Alternative, ImitatedTerm, MissingTerm
 
+Beside = Literal["same", "shorter", "longer"]
+"""A timestep beside another one."""
 Word = Literal["CALIBRATED", "USABLE", "NO_IMPROVEMENT", "NOT_IDENTIFIABLE", "MODEL_MISMATCH", "DATA_REJECTED"]
 
 
@@ -162,7 +164,7 @@ class Judged:
         alternatives: Other estimates that the log does not exclude, which the intervals cover.
         imitated: Terms that the model has none of and parameters imitate, which the intervals do not cover.
         richer: The model with the likeliest term, where a parameter of a spec adds it and there was time to test it.
-        tests: Whether what the model lacks was tested with the timestep of the errors, a `shorter`, or a `longer` one.
+        timestep_of_tests: That with which it was tested what the model lacks, beside that of the errors.
         tested: False where the log cannot tell whether the model lacks a term: it is too short, or tells no states.
         open_in_time: Parameters that only the alternatives leave open, where there was no time to test these on as many
             windows as usual.
@@ -185,7 +187,7 @@ class Judged:
     alternatives: tuple[Alternative, ...] = ()
     imitated: tuple[ImitatedTerm, ...] = ()
     richer: RicherModel | None = None
-    tests: Literal["same", "shorter", "longer"] = "same"
+    timestep_of_tests: Beside = "same"
     tested: bool = True
     open_in_time: tuple[str, ...] = ()
     at_end: tuple[str, ...] = ()

@@ -22,6 +22,7 @@ from madoc.robots.document import (
     validated,
 )
 from madoc.robots.drive_spec import ConditionSpec, DriveSpec, FrictionSpec, GearSpec
+from madoc.simulation.arrays import array_names
 from madoc.tasks import TASKS
 
 SHORTEST_TIMESTEP = 1e-6
@@ -129,10 +130,11 @@ class ParameterSpec(Part):
     @field_validator("field")
     @classmethod
     def _known(cls, field: str) -> str:
-        of_model = f"it is an array of MuJoCo's model, so write model: {field}"
-        hint = of_model if hasattr(mujoco.MjModel, field) else nearest_hint(field, FIELDS)
-        refuse(field not in (*FIELDS, "inertia"), f"expected a field that can be calibrated, got {field!r}; {hint}")
-        return field
+        if field in (*FIELDS, "inertia"):
+            return field
+        of_model = field in array_names(mujoco.MjModel.from_xml_string("<mujoco/>"))
+        hint = f"an array of MuJoCo's model is given by model: {field}" if of_model else nearest_hint(field, FIELDS)
+        raise ValueError(f"expected a field that can be calibrated, got {field!r}; {hint}")
 
     @model_validator(mode="after")
     def _consistent(self) -> "ParameterSpec":

@@ -58,7 +58,7 @@ def check_field(model: mujoco.MjModel, field: str) -> None:
     owner, name = (model.opt, array.removeprefix("opt.")) if option else (model, array)
     held = getattr(owner, name, None) if hasattr(type(owner), name) else None
     if not isinstance(held, float) and not (isinstance(held, np.ndarray) and held.dtype.kind == "f" and held.size):
-        known = option_names(model) if option else _array_names(model)
+        known = option_names(model) if option else array_names(model)
         raise MadocError(f"MuJoCo's model has no numbers {array!r}; {nearest_hint(name, known)}")
     reason = _QUATERNION if array.endswith("quat") else _NOT_FREE.get(array)
     if reason is not None:
@@ -95,7 +95,7 @@ def option_names(model: mujoco.MjModel) -> list[str]:
     return [name for name in dir(model.opt) if isinstance(getattr(model.opt, name), float | np.ndarray)]
 
 
-def _array_names(model: mujoco.MjModel) -> list[str]:
+def array_names(model: mujoco.MjModel) -> list[str]:
     """Names of the arrays of a model that have an element's number."""
     public = [name for name in dir(model) if not name.startswith("_")]
     arrays = {name: getattr(model, name) for name in public}

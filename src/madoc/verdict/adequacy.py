@@ -76,7 +76,7 @@ def far_beyond_noise(holdout: Judged) -> bool:
 
     Where a shorter timestep was tested, what that one lacks tells, as these may be errors of the longer one.
     """
-    errors = holdout.errors if isinstance(holdout, JudgedByErrors) and holdout.tests != "shorter" else None
+    errors = holdout.errors if isinstance(holdout, JudgedByErrors) and holdout.timestep_of_tests != "shorter" else None
     return errors is not None and bool(beyond_noise(errors.nearby_best, errors.noise, certain=True))
 
 
@@ -128,8 +128,8 @@ def numerical(terms: Sequence[MissingTerm]) -> MissingTerm | None:
 
 def of_timestep(holdout: Judged) -> bool:
     """Whether errors beyond noise may be those of the timestep that they were measured with."""
-    if holdout.tests != "same":
-        return holdout.tests == "shorter"  # the log does not exclude it; a longer one tells of other errors
+    if holdout.timestep_of_tests != "same":
+        return holdout.timestep_of_tests == "shorter"  # the log does not exclude it; a longer one tells of other errors
     return numerical(holdout.missing_terms) is not None
 
 

@@ -4,14 +4,13 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 from sklearn.neighbors import NearestNeighbors
 
 from madoc.calibration import CalibrationProblem
-from madoc.calibration.holdout import AgainstChance, Area
+from madoc.calibration.holdout import AgainstChance, Area, Beside
 from madoc.data import Dataset, stride
 from madoc.errors import MadocError
 from madoc.identification.fitted_windows import STRIDES
@@ -145,7 +144,7 @@ class Bench:
         shorter = self.problem.with_shorter_timestep
         return replace(self, problem=shorter, rate=self.rate / timesteps, divided=1, own=self)
 
-    def for_tests(self) -> tuple["Bench", Literal["same", "shorter", "longer"]]:
+    def for_tests(self) -> tuple["Bench", Beside]:
         """The bench on which it is tested what the model lacks, and its timestep beside that of this one.
 
         It has the shorter timestep, unless the log excludes that, if there is time for it, and else the model's own,

@@ -133,7 +133,7 @@ def judged(
         missing_terms=_worth_keeping(doubts.terms),
         alternatives=doubts.alternatives,
         imitated=doubts.imitated,
-        tests=timestep,
+        timestep_of_tests=timestep,
         tested=doubts.tested and EXCHANGED not in bench.left_out,
         open_in_time=tuple(itertools.compress(space.names, (shares >= OPEN) & (narrower < OPEN))),
         at_end=tuple(space.names[index] for index in at_end if narrower[index] < OPEN),

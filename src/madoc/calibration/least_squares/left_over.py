@@ -95,7 +95,8 @@ def with_shorter_steps(
     """
     following = replace(state, asked="size" if state.unlike_noise else "trial", epochs=state.epochs + 1)
     if not state.unlike_noise:  # less is at stake then
-        windows = windows.of(np.arange(min(len(windows.rows), max(FEWEST + len(state.point), len(windows.rows) // 2))))
+        all_windows, fewest = np.arange(len(windows.rows)), FEWEST + len(state.point)
+        windows = windows.of(all_windows[: max(fewest, len(all_windows) // 2)])
     own = _pull(windows, state, loss)
     if own is None:
         return following
